@@ -1,0 +1,166 @@
+//! The driver's logic, once for both flavours.
+
+use crate::error::{Error, Operation};
+use crate::sample::Sample;
+use crate::settings::{Address, Settings};
+use crate::transport::Transport;
+
+/// Bit 7: written, starts a single conversion; read, a conversion is under way.
+const ST_BSY: u8 = 0x80;
+/// Bit 4: single conversions.
+const SC: u8 = 0x10;
+
+/// The general call address and its reset command.
+const GENERAL_CALL: u8 = 0x00;
+const GENERAL_CALL_RESET: u8 = 0x06;
+
+/// What a poll found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Conversion {
+    /// Not finished yet: poll again later.
+    Busy,
+    /// Finished, but it was the first since power-up or a reset, after which the output register reads 0 as if that
+    /// were a result. Start the next one.
+    Discarded,
+    /// Finished; this result has not been delivered before.
+    Ready(Sample),
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum State {
+    Idle,
+    Single,
+    Continuous,
+}
+
+#[derive(Debug)]
+pub(crate) struct Core<T> {
+    pub(crate) transport: T,
+    address: Address,
+    settings: Settings,
+    state: State,
+    /// The next single conversion is the first since power-up or a reset.
+    first: bool,
+}
+
+impl<T> Core<T> {
+    pub(crate) fn new(transport: T, address: Address, settings: Settings) -> Self {
+        Self {
+            transport,
+            address,
+            settings,
+            state: State::Idle,
+            first: true,
+        }
+    }
+
+    pub(crate) fn settings(&self) -> Settings {
+        self.settings
+    }
+
+    pub(crate) fn set_settings(&mut self, settings: Settings) {
+        self.settings = settings;
+        self.state = State::Idle;
+    }
+}
+
+impl<T: Transport> Core<T> {
+    async fn write(&mut self, configuration: u8) -> Result<(), Error<T::Error>> {
+        let result = self
+            .transport
+            .write(self.address.bits(), &[configuration])
+            .await;
+        result.map_err(|source| Error::Bus {
+            operation: Operation::WriteConfiguration,
+            source,
+        })
+    }
+
+    /// Code and busy flag of a three-byte read whose configuration is as written, disregarding ST/BSY.
+    async fn read(&mut self, expected: u8) -> Result<(i16, bool), Error<T::Error>> {
+        let mut data = [0; 3];
+        let result = self.transport.read(self.address.bits(), &mut data).await;
+        result.map_err(|source| Error::Bus {
+            operation: Operation::ReadOutput,
+            source,
+        })?;
+        let [high, low, read] = data;
+        if (read ^ expected) & !ST_BSY != 0 {
+            return Err(self.lost(expected, read));
+        }
+        Ok((i16::from_be_bytes([high, low]), read & ST_BSY != 0))
+    }
+
+    fn lost(&mut self, expected: u8, read: u8) -> Error<T::Error> {
+        self.state = State::Idle;
+        self.first = true;
+        Error::ConfigurationLost { expected, read }
+    }
+
+    fn sample(&self, code: i16) -> Result<Sample, Error<T::Error>> {
+        let settings = self.settings;
+        let data_rate = settings.data_rate;
+        if (data_rate.min_code()..=data_rate.max_code()).contains(&code) {
+            Ok(Sample { code, settings })
+        } else {
+            Err(Error::CodeOutOfRange { code, data_rate })
+        }
+    }
+
+    pub(crate) async fn start(&mut self) -> Result<(), Error<T::Error>> {
+        self.state = State::Idle;
+        self.write(ST_BSY | SC | self.settings.bits()).await?;
+        self.state = State::Single;
+        Ok(())
+    }
+
+    pub(crate) async fn poll(&mut self) -> Result<Conversion, Error<T::Error>> {
+        if self.state != State::Single {
+            return Err(Error::NotStarted);
+        }
+        let (code, busy) = self.read(ST_BSY | SC | self.settings.bits()).await?;
+        if busy {
+            return Ok(Conversion::Busy);
+        }
+        self.state = State::Idle;
+        if self.first {
+            self.first = false;
+            return Ok(Conversion::Discarded);
+        }
+        self.sample(code).map(Conversion::Ready)
+    }
+
+    pub(crate) async fn start_continuous(&mut self) -> Result<(), Error<T::Error>> {
+        self.state = State::Idle;
+        self.write(ST_BSY | self.settings.bits()).await?;
+        self.state = State::Continuous;
+        Ok(())
+    }
+
+    pub(crate) async fn read_continuous(&mut self) -> Result<Sample, Error<T::Error>> {
+        if self.state != State::Continuous {
+            return Err(Error::NotStarted);
+        }
+        let expected = ST_BSY | self.settings.bits();
+        let (code, busy) = self.read(expected).await?;
+        if !busy {
+            // ST/BSY always reads 1 in this mode.
+            return Err(self.lost(expected, expected & !ST_BSY));
+        }
+        self.sample(code)
+    }
+
+    pub(crate) async fn general_call_reset(&mut self) -> Result<(), Error<T::Error>> {
+        self.state = State::Idle;
+        self.first = true;
+        let result = self
+            .transport
+            .write(GENERAL_CALL, &[GENERAL_CALL_RESET])
+            .await;
+        result.map_err(|source| Error::Bus {
+            operation: Operation::GeneralCallReset,
+            source,
+        })
+    }
+}
