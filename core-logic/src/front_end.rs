@@ -1,0 +1,1152 @@
+//! The sensor in front of the converter: volt ↔ ampere for every front end that the board can carry.
+//!
+//! Which one is fitted is configuration ([`FrontEnd`]), not a compile-time fork. Each is a straight line at a given
+//! range and supply ([`TransferLine`]); the measuring path folds that line into one multiplication
+//! (`converter::ConverterCoefficients`), and the functions here are the exact reference for it.
+//!
+//! "Signal" means the voltage that the fitted channel converts: the sensor's output (through the analog switch) for
+//! D0, D2 and D4, the network's output for D3.
+
+use serde::{Deserialize, Serialize};
+
+use crate::design_parameters as design;
+use crate::range::Range;
+use crate::units::{Microamps, Microvolts, clamp_i32, div_round, mul_div};
+
+/// Turns of a [`ClosedLoop`] sensor that [`FrontEnd::validate`] accepts.
+pub const TURNS_LIMITS: (i32, i32) = (1, 20_000);
+/// Full scales that [`FrontEnd::validate`] accepts: 1 A … 2,000 A.
+pub const FULL_SCALE_LIMITS: (Microamps, Microamps) =
+    (Microamps::from_amps(1), Microamps::from_amps(2_000));
+
+/// Smallest sensitivity of the signal that [`FrontEnd::validate`] accepts: 1 mV/A, that is 1,000 µA per µV. Below it a
+/// converter step is above 2 A, and the folded coefficients of the converter would not fit.
+pub const MAX_MICROAMPS_PER_MICROVOLT: i64 = 1_000;
+
+/// One value for each of the two sensors. A board with one sensor uses both alike, or the first.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct PerRange<T> {
+    /// For the small sensor.
+    pub small: T,
+    /// For the large sensor.
+    pub large: T,
+}
+
+impl<T> PerRange<T> {
+    /// The value of `range`, in place.
+    #[must_use]
+    pub const fn of(&self, range: Range) -> &T {
+        match range {
+            Range::Small => &self.small,
+            Range::Large => &self.large,
+        }
+    }
+
+    /// The value of `range`, to be changed in place.
+    #[must_use]
+    pub const fn of_mut(&mut self, range: Range) -> &mut T {
+        match range {
+            Range::Small => &mut self.small,
+            Range::Large => &mut self.large,
+        }
+    }
+}
+
+impl<T: Copy> PerRange<T> {
+    /// The same value for both.
+    #[must_use]
+    pub const fn both(value: T) -> Self {
+        Self {
+            small: value,
+            large: value,
+        }
+    }
+
+    /// The value of `range`.
+    #[must_use]
+    pub const fn get(&self, range: Range) -> T {
+        *self.of(range)
+    }
+
+    /// Replaces the value of `range`.
+    pub const fn set(&mut self, range: Range, value: T) {
+        *self.of_mut(range) = value;
+    }
+}
+
+/// The analogue-to-digital converter that reads a front end's signal.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Channel {
+    /// The external ΔΣ converter, 0 … 5 V.
+    Ads1100,
+    /// The microcontroller's own converter, 0 … 3.3 V.
+    Adc1,
+}
+
+/// The span of a signal inside which it follows the current.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct OutputLimits {
+    /// Lowest legal signal.
+    pub low: Microvolts,
+    /// Highest legal signal.
+    pub high: Microvolts,
+}
+
+/// `I = (V − zero) · numerator / denominator` with I in µA and V, zero in nV.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TransferLine {
+    /// Signal at 0 A in nV.
+    pub zero_nanovolts: i64,
+    /// µA …
+    pub numerator: i64,
+    /// … per nV. Positive.
+    pub denominator: i64,
+}
+
+impl TransferLine {
+    /// The current, rounded to the nearest µA, stopping at the ends of the type.
+    #[must_use]
+    pub const fn current(&self, volts: Microvolts) -> Microamps {
+        let above_zero = (volts.get() as i64 * 1_000).saturating_sub(self.zero_nanovolts);
+        Microamps(clamp_i32(mul_div(
+            above_zero,
+            self.numerator,
+            self.denominator,
+        )))
+    }
+
+    /// The signal, within 0.501 µV of the exact one, stopping at the ends of the type.
+    #[must_use]
+    pub const fn voltage(&self, current: Microamps) -> Microvolts {
+        let above_zero = mul_div(current.get() as i64, self.denominator, self.numerator);
+        Microvolts(clamp_i32(div_round(
+            self.zero_nanovolts.saturating_add(above_zero),
+            1_000,
+        )))
+    }
+
+    const fn new(zero_nanovolts: i64, numerator: i64, denominator: i64) -> Self {
+        Self {
+            zero_nanovolts,
+            numerator,
+            // Reached by a configuration that `validate` refuses: a huge current is then marked as beyond limits,
+            // where a division by zero would read 0 A.
+            denominator: if denominator > 0 { denominator } else { 1 },
+        }
+    }
+}
+
+/// D4's two linear relations of a sensor to its supply Vc:
+/// `Vout = (k1·Vc + m1)·Ip/N + k2·Vc + m2`, as the least-squares calibration fills them.
+///
+/// Rounding k1, m1 to 1 nΩ and k2, m2 to 1 nV costs less than 1 mA over ±600 A and 4.5 … 5.5 V for every sensor with
+/// at least 3 mV/A, also with N = 1.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct SupplyRelations {
+    /// k1: transfer impedance per volt of supply, in nΩ/V (referred to the secondary, Ip/N).
+    pub k1_nanoohm_per_volt: i64,
+    /// m1: transfer impedance at Vc = 0, in nΩ.
+    pub m1_nanoohm: i64,
+    /// k2: zero output per volt of supply, in nV/V.
+    pub k2_nanovolt_per_volt: i64,
+    /// m2: zero output at Vc = 0, in nV.
+    pub m2_nanovolt: i64,
+}
+
+impl SupplyRelations {
+    /// `k1·Vc + m1` in nΩ, rounded to nearest.
+    #[must_use]
+    pub const fn impedance_nanoohm(&self, supply: Microvolts) -> i64 {
+        mul_div(self.k1_nanoohm_per_volt, supply.get() as i64, 1_000_000)
+            .saturating_add(self.m1_nanoohm)
+    }
+
+    /// `k2·Vc + m2`, the output at 0 A, in nV, rounded to nearest.
+    #[must_use]
+    pub const fn zero_nanovolt(&self, supply: Microvolts) -> i64 {
+        mul_div(self.k2_nanovolt_per_volt, supply.get() as i64, 1_000_000)
+            .saturating_add(self.m2_nanovolt)
+    }
+}
+
+impl Default for SupplyRelations {
+    /// The rated sensor, fully ratiometric.
+    fn default() -> Self {
+        Self {
+            k1_nanoohm_per_volt: design::CLOSED_LOOP_K1_NANOOHM_PER_VOLT,
+            m1_nanoohm: 0,
+            k2_nanovolt_per_volt: design::CLOSED_LOOP_K2_NANOVOLT_PER_VOLT,
+            m2_nanovolt: 0,
+        }
+    }
+}
+
+/// D4's two factors, taken before the high voltage is switched on: the signal is corrected to `k·(V + a)`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct KeyFactors {
+    /// `k = VOUT0 / VC1` in 10⁻⁹ (one is 1,000,000,000): 0.5·10⁻⁹ of a 5 V signal is 2.5 nV.
+    pub k_ppb: i32,
+    /// `a = VC1 − VC2`.
+    pub a: Microvolts,
+}
+
+impl KeyFactors {
+    /// `k` = 1.
+    pub const K_ONE_PPB: i32 = 1_000_000_000;
+    /// No correction.
+    pub const NONE: Self = Self {
+        k_ppb: Self::K_ONE_PPB,
+        a: Microvolts::ZERO,
+    };
+
+    /// `k·(V + a)`, rounded to the nearest µV.
+    #[must_use]
+    pub const fn apply(&self, volts: Microvolts) -> Microvolts {
+        let sum = volts.get() as i64 + self.a.get() as i64;
+        Microvolts(clamp_i32(mul_div(
+            sum,
+            self.k_ppb as i64,
+            Self::K_ONE_PPB as i64,
+        )))
+    }
+}
+
+impl Default for KeyFactors {
+    fn default() -> Self {
+        Self::NONE
+    }
+}
+
+/// D0: two linear sensors, selected by the analog switch; `I = (V − zero) · full scale / swing`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct DualRange {
+    /// Current at the end of each sensor's range.
+    pub full_scale: PerRange<Microamps>,
+    /// Output swing from 0 A to the end of the range, both sensors.
+    pub swing: Microvolts,
+    /// Output at 0 A, both sensors.
+    pub zero: Microvolts,
+}
+
+impl Default for DualRange {
+    fn default() -> Self {
+        Self {
+            full_scale: PerRange {
+                small: design::SMALL_FULL_SCALE,
+                large: design::LARGE_FULL_SCALE,
+            },
+            swing: design::DUAL_RANGE_SWING,
+            zero: design::SENSOR_ZERO,
+        }
+    }
+}
+
+/// D2: one LEM HAH1BV; `I = (V − 2.5 V) / (4 mV/A)`, that is `250 · (V − 2.5)`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Hah1bv {
+    /// Sensitivity at the rated supply.
+    pub microvolts_per_amp: i32,
+    /// End of the range, both signs.
+    pub full_scale: Microamps,
+}
+
+impl Default for Hah1bv {
+    fn default() -> Self {
+        Self {
+            microvolts_per_amp: design::HAH1BV_MICROVOLTS_PER_AMP,
+            full_scale: design::HAH1BV_FULL_SCALE,
+        }
+    }
+}
+
+/// D3: one sensor with a bipolar output, read through the open-sensor network: `Vadc = 0.225 · Vhall + 1.65 V`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Network {
+    /// Sensitivity at the Hall output.
+    pub sensor_nanovolts_per_amp: i32,
+    /// Hall output at 0 A.
+    pub sensor_zero: Microvolts,
+    /// End of the range, both signs.
+    pub full_scale: Microamps,
+}
+
+impl Default for Network {
+    fn default() -> Self {
+        Self {
+            sensor_nanovolts_per_amp: design::NETWORK_SENSOR_NANOVOLTS_PER_AMP,
+            sensor_zero: Microvolts::ZERO,
+            full_scale: design::NETWORK_SENSOR_FULL_SCALE,
+        }
+    }
+}
+
+/// D4: one closed-loop sensor with turns ratio N, calibrated over its supply:
+/// `Ip = (V − (k2·Vc + m2)) · N / (k1·Vc + m1)`, V being the signal after the key-state factors.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct ClosedLoop {
+    /// Turns ratio N.
+    pub turns: i32,
+    /// k1, m1, k2, m2.
+    pub relations: SupplyRelations,
+    /// End of the range, both signs.
+    pub full_scale: Microamps,
+}
+
+impl Default for ClosedLoop {
+    fn default() -> Self {
+        Self {
+            turns: design::CLOSED_LOOP_TURNS,
+            relations: SupplyRelations::default(),
+            full_scale: design::CLOSED_LOOP_FULL_SCALE,
+        }
+    }
+}
+
+/// Why [`FrontEnd::validate`] refuses a front end.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum FrontEndError {
+    /// A full scale is outside [`FULL_SCALE_LIMITS`], or the large one is not above the small one.
+    FullScale,
+    /// The sensitivity is not positive or below [`MAX_MICROAMPS_PER_MICROVOLT`], or the signal would leave the
+    /// channel's input before full scale.
+    Sensitivity,
+    /// N is outside [`TURNS_LIMITS`].
+    Turns,
+    /// `k1·Vc + m1` is not positive, or the zero output is outside the supply, somewhere in 4.5 … 5.5 V.
+    Relations,
+}
+
+/// The front end that is fitted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum FrontEnd {
+    /// D0: small and large Hall sensor with analog switch.
+    DualRange(DualRange),
+    /// D2: one HAH1BV.
+    Hah1bv(Hah1bv),
+    /// D3: the current itself through the open-sensor network.
+    Network(Network),
+    /// D4: closed loop with turns ratio and supply relations.
+    ClosedLoop(ClosedLoop),
+}
+
+impl Default for FrontEnd {
+    fn default() -> Self {
+        Self::DualRange(DualRange::default())
+    }
+}
+
+impl FrontEnd {
+    /// The line between signal and current.
+    ///
+    /// For D0, D2 and D3 the signal is the one at the rated supply and `supply` has no influence (the converter
+    /// refers a ratiometric signal to 5 V before). For D4 the signal is the actual one and `supply` is Vc.
+    #[must_use]
+    pub const fn line(&self, range: Range, supply: Microvolts) -> TransferLine {
+        match self {
+            Self::DualRange(sensor) => TransferLine::new(
+                sensor.zero.get() as i64 * 1_000,
+                sensor.full_scale.get(range).get() as i64,
+                sensor.swing.get() as i64 * 1_000,
+            ),
+            Self::Hah1bv(sensor) => TransferLine::new(
+                design::SENSOR_ZERO.get() as i64 * 1_000,
+                1_000_000,
+                sensor.microvolts_per_amp as i64 * 1_000,
+            ),
+            Self::Network(sensor) => {
+                let (gain, per) = design::NETWORK_GAIN;
+                TransferLine::new(
+                    network_output_nanovolts(sensor.sensor_zero.get() as i64 * 1_000),
+                    1_000_000 * per,
+                    sensor.sensor_nanovolts_per_amp as i64 * gain,
+                )
+            }
+            // nV / nΩ is the secondary current in A.
+            Self::ClosedLoop(sensor) => TransferLine::new(
+                sensor.relations.zero_nanovolt(supply),
+                sensor.turns as i64 * 1_000_000,
+                sensor.relations.impedance_nanoohm(supply),
+            ),
+        }
+    }
+
+    /// The current behind a signal, rounded to the nearest µA, stopping at the ends of the type. See
+    /// [`FrontEnd::line`] for what `volts` and `supply` mean.
+    #[must_use]
+    pub const fn current(&self, volts: Microvolts, range: Range, supply: Microvolts) -> Microamps {
+        self.line(range, supply).current(volts)
+    }
+
+    /// The signal at a current, within 0.501 µV, stopping at the ends of the type. The sensor's saturation is not
+    /// in it: see [`FrontEnd::output_limits`].
+    #[must_use]
+    pub const fn voltage(
+        &self,
+        current: Microamps,
+        range: Range,
+        supply: Microvolts,
+    ) -> Microvolts {
+        self.line(range, supply).voltage(current)
+    }
+
+    /// The signal at 0 A.
+    #[must_use]
+    pub const fn zero_output(&self, range: Range, supply: Microvolts) -> Microvolts {
+        self.voltage(Microamps::ZERO, range, supply)
+    }
+
+    /// The signals at both ends of the range at the rated supply; at them, or beyond, the sensor may be saturated.
+    #[must_use]
+    pub const fn output_limits(&self, range: Range) -> OutputLimits {
+        self.output_limits_at(range, design::SENSOR_NOMINAL_SUPPLY)
+    }
+
+    /// As [`FrontEnd::output_limits`] at another supply, which moves them for D4 alone.
+    #[must_use]
+    pub const fn output_limits_at(&self, range: Range, supply: Microvolts) -> OutputLimits {
+        let full_scale = self.full_scale(range);
+        OutputLimits {
+            low: self.voltage(Microamps(full_scale.get().saturating_neg()), range, supply),
+            high: self.voltage(full_scale, range, supply),
+        }
+    }
+
+    /// The current at the end of the sensor's range.
+    #[must_use]
+    pub const fn full_scale(&self, range: Range) -> Microamps {
+        match self {
+            Self::DualRange(sensor) => sensor.full_scale.get(range),
+            Self::Hah1bv(sensor) => sensor.full_scale,
+            Self::Network(sensor) => sensor.full_scale,
+            Self::ClosedLoop(sensor) => sensor.full_scale,
+        }
+    }
+
+    /// The current at which V1 of the energy meter is 0.5 V: the board scales the signal's distance from its zero by
+    /// [`design::CHANNEL_1_SCALE`], so that is 2.25 V of signal. 60 A and 600 A for D0, 562.5 A for the HAH1BV.
+    ///
+    /// D3 is the same with the network's output as the signal: its bipolar Hall output cannot pass the 5 V switch.
+    #[must_use]
+    pub const fn meter_full_scale(&self, range: Range) -> Microamps {
+        let (numerator, denominator) = design::CHANNEL_1_SCALE;
+        let signal_nanovolts = mul_div(
+            design::METER_FULL_SCALE_INPUT.get() as i64 * 1_000,
+            denominator,
+            numerator,
+        );
+        let line = self.line(range, design::SENSOR_NOMINAL_SUPPLY);
+        Microamps(clamp_i32(mul_div(
+            signal_nanovolts,
+            line.numerator,
+            line.denominator,
+        )))
+    }
+
+    /// The converter that reads the signal.
+    #[must_use]
+    pub const fn channel(&self) -> Channel {
+        match self {
+            Self::Network(_) => Channel::Adc1,
+            Self::DualRange(_) | Self::Hah1bv(_) | Self::ClosedLoop(_) => Channel::Ads1100,
+        }
+    }
+
+    /// Whether the range flag selects between two sensors. With one sensor the range has no influence on anything
+    /// here, and the caller keeps it at [`Range::Small`].
+    #[must_use]
+    pub const fn has_two_ranges(&self) -> bool {
+        matches!(self, Self::DualRange(_))
+    }
+
+    /// Refuses what cannot be a sensor of this board.
+    ///
+    /// # Errors
+    /// The first of the reasons in [`FrontEndError`].
+    pub fn validate(&self) -> Result<(), FrontEndError> {
+        let full_scale_fits =
+            |current: Microamps| (FULL_SCALE_LIMITS.0..=FULL_SCALE_LIMITS.1).contains(&current);
+        if !full_scale_fits(self.full_scale(Range::Small))
+            || !full_scale_fits(self.full_scale(Range::Large))
+        {
+            return Err(FrontEndError::FullScale);
+        }
+        match self {
+            Self::DualRange(sensor) if sensor.full_scale.large <= sensor.full_scale.small => {
+                return Err(FrontEndError::FullScale);
+            }
+            Self::ClosedLoop(sensor) => {
+                if !(TURNS_LIMITS.0..=TURNS_LIMITS.1).contains(&sensor.turns) {
+                    return Err(FrontEndError::Turns);
+                }
+                // Both relations are straight lines: what holds at the ends holds between them.
+                for supply in [design::SENSOR_SUPPLY_LOW, design::SENSOR_SUPPLY_HIGH] {
+                    let zero = sensor.relations.zero_nanovolt(supply);
+                    if sensor.relations.impedance_nanoohm(supply) <= 0
+                        || zero <= 0
+                        || zero >= i64::from(supply.get()) * 1_000
+                    {
+                        return Err(FrontEndError::Relations);
+                    }
+                }
+            }
+            Self::DualRange(_) | Self::Hah1bv(_) | Self::Network(_) => {}
+        }
+        let input = match self.channel() {
+            Channel::Ads1100 => design::CONVERTER_NOMINAL_SUPPLY,
+            Channel::Adc1 => design::NETWORK_CLAMP,
+        };
+        let limits = self.output_limits(Range::Small);
+        // A sensitivity that is not positive has become an immense one in the line.
+        let is_too_coarse = [design::SENSOR_SUPPLY_LOW, design::SENSOR_SUPPLY_HIGH]
+            .into_iter()
+            .map(|supply| self.line(Range::Large, supply))
+            .any(|line| {
+                mul_div(line.numerator, 1_000, line.denominator) > MAX_MICROAMPS_PER_MICROVOLT
+            });
+        if is_too_coarse || limits.low <= Microvolts::ZERO || limits.high >= input {
+            return Err(FrontEndError::Sensitivity);
+        }
+        Ok(())
+    }
+}
+
+/// D3's network with the sensor connected: 0.225 · Vhall + 1.65 V, in nV.
+pub(crate) const fn network_output_nanovolts(hall_nanovolts: i64) -> i64 {
+    let (gain, per) = design::NETWORK_GAIN;
+    // (Vref · R4 / (R3 + R4)) · (1 + R1/R2)
+    let reference = mul_div(
+        design::NETWORK_REFERENCE.get() as i64 * 1_000 * design::R4_OHM,
+        design::R1_OHM + design::R2_OHM,
+        (design::R3_OHM + design::R4_OHM) * design::R2_OHM,
+    );
+    mul_div(hall_nanovolts, gain, per).saturating_add(reference)
+}
+
+#[cfg(test)]
+#[allow(
+    clippy::unwrap_used,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss
+)]
+pub(crate) mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const FIVE: Microvolts = Microvolts::from_millivolts(5_000);
+
+    fn millivolts(value: i32) -> Microvolts {
+        Microvolts::from_millivolts(value)
+    }
+
+    fn all() -> [FrontEnd; 4] {
+        [
+            FrontEnd::DualRange(DualRange::default()),
+            FrontEnd::Hah1bv(Hah1bv::default()),
+            FrontEnd::Network(Network::default()),
+            FrontEnd::ClosedLoop(ClosedLoop::default()),
+        ]
+    }
+
+    pub(crate) fn any_range() -> impl Strategy<Value = Range> {
+        prop_oneof![Just(Range::Small), Just(Range::Large)]
+    }
+
+    /// Front ends that `validate` accepts.
+    pub(crate) fn any_valid() -> impl Strategy<Value = FrontEnd> {
+        let valid = prop_oneof![
+            (1_000_000..100_000_000, 1..10_i32, 1_000_000..2_400_000).prop_map(
+                |(small, ratio, swing)| {
+                    FrontEnd::DualRange(DualRange {
+                        full_scale: PerRange {
+                            small: Microamps(small),
+                            large: Microamps(small * ratio + 1),
+                        },
+                        swing: Microvolts(swing),
+                        zero: millivolts(2_500),
+                    })
+                }
+            ),
+            (1_000..20_000, 1_000_000..1_000_000_000).prop_map(|(sensitivity, full_scale)| {
+                FrontEnd::Hah1bv(Hah1bv {
+                    microvolts_per_amp: sensitivity,
+                    full_scale: Microamps(full_scale),
+                })
+            }),
+            (
+                5_000_000..80_000_000,
+                -200_000..200_000,
+                1_000_000..1_000_000_000
+            )
+                .prop_map(|(sensitivity, zero, full_scale)| {
+                    FrontEnd::Network(Network {
+                        sensor_nanovolts_per_amp: sensitivity,
+                        sensor_zero: Microvolts(zero),
+                        full_scale: Microamps(full_scale),
+                    })
+                }),
+            any_closed_loop().prop_map(FrontEnd::ClosedLoop),
+        ];
+        valid.prop_filter("accepted", |front_end| front_end.validate().is_ok())
+    }
+
+    fn any_closed_loop() -> impl Strategy<Value = ClosedLoop> {
+        (
+            1..5_000_i32,
+            3_000_000..20_000_000_i64,
+            0..=100_i64,
+            400_000_000..600_000_000_i64,
+            -200_000_000..200_000_000_i64,
+            1_000_000..600_000_000,
+        )
+            .prop_map(|(turns, nanovolts_per_amp, share, k2, m2, full_scale)| {
+                // `share` percent of the impedance follows the supply.
+                let impedance = nanovolts_per_amp * i64::from(turns);
+                ClosedLoop {
+                    turns,
+                    relations: SupplyRelations {
+                        k1_nanoohm_per_volt: impedance * share / 500,
+                        m1_nanoohm: impedance * (100 - share) / 100,
+                        k2_nanovolt_per_volt: k2,
+                        m2_nanovolt: m2,
+                    },
+                    full_scale: Microamps(full_scale),
+                }
+            })
+    }
+
+    pub(crate) fn any_supply() -> impl Strategy<Value = Microvolts> {
+        (4_500_000..=5_500_000).prop_map(Microvolts)
+    }
+
+    /// Front ends with any numbers at all.
+    pub(crate) fn any_front_end() -> impl Strategy<Value = FrontEnd> {
+        prop_oneof![
+            any::<[i32; 4]>().prop_map(|[small, large, swing, zero]| {
+                FrontEnd::DualRange(DualRange {
+                    full_scale: PerRange {
+                        small: Microamps(small),
+                        large: Microamps(large),
+                    },
+                    swing: Microvolts(swing),
+                    zero: Microvolts(zero),
+                })
+            }),
+            any::<[i32; 2]>().prop_map(|[sensitivity, full_scale]| {
+                FrontEnd::Hah1bv(Hah1bv {
+                    microvolts_per_amp: sensitivity,
+                    full_scale: Microamps(full_scale),
+                })
+            }),
+            any::<[i32; 3]>().prop_map(|[sensitivity, zero, full_scale]| {
+                FrontEnd::Network(Network {
+                    sensor_nanovolts_per_amp: sensitivity,
+                    sensor_zero: Microvolts(zero),
+                    full_scale: Microamps(full_scale),
+                })
+            }),
+            (any::<[i64; 4]>(), any::<i32>(), any::<i32>()).prop_map(
+                |([k1, m1, k2, m2], turns, full_scale)| {
+                    FrontEnd::ClosedLoop(ClosedLoop {
+                        turns,
+                        relations: SupplyRelations {
+                            k1_nanoohm_per_volt: k1,
+                            m1_nanoohm: m1,
+                            k2_nanovolt_per_volt: k2,
+                            m2_nanovolt: m2,
+                        },
+                        full_scale: Microamps(full_scale),
+                    })
+                }
+            ),
+        ]
+    }
+
+    #[test]
+    fn d0_reproduces_its_numbers() {
+        let d0 = FrontEnd::default();
+        let small = |volts| d0.current(volts, Range::Small, FIVE);
+        assert_eq!(
+            d0.voltage(Microamps::from_amps(55), Range::Small, FIVE),
+            Microvolts(4_562_500)
+        );
+        assert_eq!(small(Microvolts(4_562_500)), Microamps::from_amps(55));
+        assert_eq!(small(design::COMPARATOR_HIGH), design::SWITCHING_CURRENT);
+        assert_eq!(
+            small(design::COMPARATOR_LOW),
+            Microamps(-design::SWITCHING_CURRENT.get())
+        );
+        assert_eq!(
+            d0.voltage(design::SWITCHING_CURRENT, Range::Small, FIVE),
+            design::COMPARATOR_HIGH
+        );
+        assert_eq!(
+            d0.voltage(
+                Microamps(-design::SWITCHING_CURRENT.get()),
+                Range::Small,
+                FIVE
+            ),
+            design::COMPARATOR_LOW
+        );
+        assert_eq!(
+            d0.current(millivolts(4_750), Range::Large, FIVE),
+            Microamps::from_amps(600)
+        );
+        assert_eq!(
+            d0.current(millivolts(250), Range::Large, FIVE),
+            Microamps::from_amps(-600)
+        );
+        assert_eq!(small(millivolts(2_500)), Microamps::ZERO);
+    }
+
+    #[test]
+    fn d2_is_250_times_the_distance_from_half_the_supply() {
+        let d2 = FrontEnd::Hah1bv(Hah1bv::default());
+        for offset in [-2_000_000, -123_457, -1, 0, 1, 77, 2_000_000] {
+            let volts = Microvolts(2_500_000 + offset);
+            assert_eq!(
+                d2.current(volts, Range::Small, FIVE),
+                Microamps(250 * offset)
+            );
+            assert_eq!(
+                d2.voltage(Microamps(250 * offset), Range::Large, FIVE),
+                volts
+            );
+        }
+    }
+
+    #[test]
+    fn d3_reproduces_its_numbers() {
+        let d3 = FrontEnd::Network(Network::default());
+        let volts = |amps| d3.voltage(Microamps::from_amps(amps), Range::Small, FIVE);
+        assert_eq!(volts(0), millivolts(1_650));
+        assert_eq!(volts(500), millivolts(2_550));
+        assert_eq!(volts(-500), millivolts(750));
+        assert_eq!(
+            d3.current(millivolts(2_550), Range::Small, FIVE),
+            Microamps::from_amps(500)
+        );
+        let shifted = FrontEnd::Network(Network {
+            sensor_zero: millivolts(1_000),
+            ..Network::default()
+        });
+        assert_eq!(shifted.zero_output(Range::Small, FIVE), millivolts(1_875));
+        assert_eq!(design::NETWORK_GAIN, (9, 40));
+    }
+
+    #[test]
+    fn d4_follows_its_supply() {
+        let d4 = FrontEnd::ClosedLoop(ClosedLoop::default());
+        let at = |volts, supply| d4.current(millivolts(volts), Range::Small, millivolts(supply));
+        let close = |current: Microamps, amps: i32| {
+            // k1 is rounded in its tenth digit.
+            assert!(
+                (current.get() - amps * 1_000_000).abs() <= 1,
+                "{current:?} {amps}"
+            );
+        };
+        close(at(4_500, 5_000), 300);
+        close(at(4_050, 4_500), 300);
+        close(at(550, 5_500), -300);
+        assert_eq!(at(2_250, 4_500), Microamps::ZERO);
+        assert_eq!(
+            d4.zero_output(Range::Large, millivolts(5_500)),
+            millivolts(2_750)
+        );
+        // Both relations with all four numbers: (2 Ω/V · 5 V + 3 Ω) · I / 1000 + 0.4 · 5 V + 0.1 V.
+        let sensor = FrontEnd::ClosedLoop(ClosedLoop {
+            turns: 1_000,
+            relations: SupplyRelations {
+                k1_nanoohm_per_volt: 2_000_000_000,
+                m1_nanoohm: 3_000_000_000,
+                k2_nanovolt_per_volt: 400_000_000,
+                m2_nanovolt: 100_000_000,
+            },
+            full_scale: Microamps::from_amps(100),
+        });
+        assert_eq!(
+            sensor.voltage(Microamps::from_amps(100), Range::Small, FIVE),
+            millivolts(3_400)
+        );
+        assert_eq!(
+            sensor.current(millivolts(3_400), Range::Small, FIVE),
+            Microamps::from_amps(100)
+        );
+        assert_eq!(
+            sensor.output_limits_at(Range::Small, FIVE).low,
+            millivolts(800)
+        );
+    }
+
+    #[test]
+    fn d4_example_returns_0_a_in_acc() {
+        // VOUT0 = 2.5 V, VC1 = 2.49 V, VC2 = 2.48 V: a = 0.01 V, k = 2.5 / 2.49.
+        let factors = KeyFactors {
+            k_ppb: 1_004_016_064,
+            a: millivolts(10),
+        };
+        let d4 = FrontEnd::ClosedLoop(ClosedLoop::default());
+        let corrected = factors.apply(millivolts(2_480));
+        assert_eq!(corrected, millivolts(2_500));
+        assert_eq!(d4.current(corrected, Range::Small, FIVE), Microamps::ZERO);
+        assert_eq!(
+            KeyFactors {
+                a: Microvolts::ZERO,
+                ..factors
+            }
+            .apply(millivolts(2_490)),
+            millivolts(2_500)
+        );
+        assert_eq!(KeyFactors::default(), KeyFactors::NONE);
+        assert_eq!(
+            KeyFactors::NONE.apply(Microvolts(-1_234_567)),
+            Microvolts(-1_234_567)
+        );
+    }
+
+    #[test]
+    fn outputs_end_where_the_documents_say() {
+        let limits = all().map(|front_end| front_end.output_limits(Range::Small));
+        assert_eq!(limits[0].low, design::DUAL_RANGE_OUTPUT_LOW);
+        assert_eq!(limits[0].high, design::DUAL_RANGE_OUTPUT_HIGH);
+        assert_eq!(limits[1].low, design::HAH1BV_OUTPUT_LOW);
+        assert_eq!(limits[1].high, design::HAH1BV_OUTPUT_HIGH);
+        assert_eq!(limits[2].low, millivolts(750));
+        assert_eq!(limits[2].high, millivolts(2_550));
+        assert_eq!(limits[3].low, millivolts(500));
+        assert_eq!(limits[3].high, millivolts(4_500));
+        assert_eq!(all()[0].output_limits(Range::Large), limits[0]);
+        let at_4_5 = all()[3].output_limits_at(Range::Small, millivolts(4_500));
+        assert_eq!(
+            (at_4_5.low, at_4_5.high),
+            (millivolts(450), millivolts(4_050))
+        );
+    }
+
+    #[test]
+    fn meter_is_at_full_scale_with_2_25_v_of_signal() {
+        let full_scales = all().map(|front_end| front_end.meter_full_scale(Range::Small));
+        assert_eq!(full_scales[0], Microamps::from_amps(60));
+        assert_eq!(
+            all()[0].meter_full_scale(Range::Large),
+            Microamps::from_amps(600)
+        );
+        assert_eq!(full_scales[1], Microamps(562_500_000));
+        assert_eq!(full_scales[2], Microamps::from_amps(1_250));
+        assert_eq!(full_scales[3], Microamps(337_500_000));
+    }
+
+    #[test]
+    fn only_d3_is_on_adc1_and_only_d0_has_two_ranges() {
+        assert_eq!(
+            all().map(|front_end| front_end.channel()),
+            [
+                Channel::Ads1100,
+                Channel::Ads1100,
+                Channel::Adc1,
+                Channel::Ads1100
+            ]
+        );
+        assert_eq!(
+            all().map(|front_end| front_end.has_two_ranges()),
+            [true, false, false, false]
+        );
+        assert_eq!(
+            all().map(|front_end| front_end.full_scale(Range::Large).get() / 1_000_000),
+            [600, 500, 500, 300]
+        );
+        assert_eq!(all()[0].full_scale(Range::Small), Microamps::from_amps(60));
+    }
+
+    #[test]
+    fn per_range_keeps_its_two_values_apart() {
+        let mut pair = PerRange::both(1);
+        pair.set(Range::Large, 2);
+        assert_eq!((pair.get(Range::Small), pair.get(Range::Large)), (1, 2));
+        pair.set(Range::Small, 3);
+        assert_eq!(pair, PerRange { small: 3, large: 2 });
+    }
+
+    #[test]
+    fn validation_names_the_reason() {
+        for front_end in all() {
+            assert_eq!(front_end.validate(), Ok(()));
+        }
+        let d0 = |small: i32, large: i32, swing: i32| {
+            FrontEnd::DualRange(DualRange {
+                full_scale: PerRange {
+                    small: Microamps(small),
+                    large: Microamps(large),
+                },
+                swing: Microvolts(swing),
+                ..DualRange::default()
+            })
+            .validate()
+        };
+        assert_eq!(
+            d0(999_999, 600_000_000, 2_250_000),
+            Err(FrontEndError::FullScale)
+        );
+        assert_eq!(d0(1_000_000, 2_000_000_000, 2_250_000), Ok(()));
+        assert_eq!(
+            d0(60_000_000, 2_000_000_001, 2_250_000),
+            Err(FrontEndError::FullScale)
+        );
+        assert_eq!(
+            d0(60_000_000, 60_000_000, 2_250_000),
+            Err(FrontEndError::FullScale)
+        );
+        assert_eq!(d0(60_000_000, 60_000_001, 2_250_000), Ok(()));
+        assert_eq!(
+            d0(60_000_000, 600_000_000, 0),
+            Err(FrontEndError::Sensitivity)
+        );
+        assert_eq!(
+            d0(60_000_000, 600_000_000, -1),
+            Err(FrontEndError::Sensitivity)
+        );
+        assert_eq!(
+            d0(60_000_000, 600_000_000, 2_500_000),
+            Err(FrontEndError::Sensitivity)
+        );
+        assert_eq!(d0(60_000_000, 600_000_000, 2_499_999), Ok(()));
+        assert_eq!(d0(60_000_000, 600_000_000, 600_000), Ok(()));
+        assert_eq!(
+            d0(60_000_000, 601_000_000, 600_000),
+            Err(FrontEndError::Sensitivity)
+        );
+        let high_zero = |zero| {
+            FrontEnd::DualRange(DualRange {
+                zero: Microvolts(zero),
+                ..DualRange::default()
+            })
+            .validate()
+        };
+        assert_eq!(high_zero(2_749_999), Ok(()));
+        assert_eq!(high_zero(2_750_000), Err(FrontEndError::Sensitivity));
+        assert_eq!(high_zero(2_250_000), Err(FrontEndError::Sensitivity));
+        let hah1bv = |microvolts_per_amp| {
+            FrontEnd::Hah1bv(Hah1bv {
+                microvolts_per_amp,
+                ..Hah1bv::default()
+            })
+            .validate()
+        };
+        assert_eq!(hah1bv(0), Err(FrontEndError::Sensitivity));
+        assert_eq!(hah1bv(1_000), Ok(()));
+        assert_eq!(hah1bv(999), Err(FrontEndError::Sensitivity));
+        let network = |sensor_nanovolts_per_amp| {
+            FrontEnd::Network(Network {
+                sensor_nanovolts_per_amp,
+                ..Network::default()
+            })
+            .validate()
+        };
+        assert_eq!(network(-1), Err(FrontEndError::Sensitivity));
+        // ±1.65 V of 0 … 3.3 V: 1.65 V / 0.225 / 500 A.
+        assert_eq!(network(14_666_000), Ok(()));
+        assert_eq!(network(14_667_000), Err(FrontEndError::Sensitivity));
+    }
+
+    #[test]
+    fn validation_of_d4_holds_over_the_supply() {
+        let default = ClosedLoop::default();
+        let with = |turns, relations| {
+            FrontEnd::ClosedLoop(ClosedLoop {
+                turns,
+                relations,
+                ..default
+            })
+            .validate()
+        };
+        assert_eq!(with(0, default.relations), Err(FrontEndError::Turns));
+        assert_eq!(with(20_001, default.relations), Err(FrontEndError::Turns));
+        // 1 turn: 13.3 Ω is 13.3 V/A.
+        assert_eq!(with(1, default.relations), Err(FrontEndError::Sensitivity));
+        assert_eq!(
+            with(20_000, default.relations),
+            Err(FrontEndError::Sensitivity)
+        );
+        let relations = |k1, m1, k2, m2| SupplyRelations {
+            k1_nanoohm_per_volt: k1,
+            m1_nanoohm: m1,
+            k2_nanovolt_per_volt: k2,
+            m2_nanovolt: m2,
+        };
+        let half = 500_000_000;
+        // Zero impedance at one end of the supply alone.
+        assert_eq!(
+            with(2_000, relations(4_000_000_000, -18_000_000_000, half, 0)),
+            Err(FrontEndError::Relations)
+        );
+        assert_eq!(
+            with(2_000, relations(-4_000_000_000, 22_000_000_000, half, 0)),
+            Err(FrontEndError::Relations)
+        );
+        // Zero output at ground, and at the supply, at one end alone.
+        assert_eq!(
+            with(2_000, relations(0, 13_000_000_000, half, -2_250_000_000)),
+            Err(FrontEndError::Relations)
+        );
+        assert_eq!(
+            with(2_000, relations(0, 13_000_000_000, 0, 4_500_000_000)),
+            Err(FrontEndError::Relations)
+        );
+        assert_eq!(
+            with(2_000, relations(0, 13_000_000_000, 0, 2_500_000_000)),
+            Ok(())
+        );
+        // 1 mV/A with N = 2,000 is 2 Ω: below it at one end of the supply alone.
+        let coarse = Err(FrontEndError::Sensitivity);
+        assert_eq!(
+            with(2_000, relations(1_000_000_000, -2_501_000_000, half, 0)),
+            coarse
+        );
+        assert_eq!(
+            with(2_000, relations(-1_000_000_000, 7_499_000_000, half, 0)),
+            coarse
+        );
+        assert_eq!(
+            with(2_000, relations(-1_000_000_000, 7_500_000_000, half, 0)),
+            Ok(())
+        );
+        assert_eq!(
+            FrontEnd::ClosedLoop(ClosedLoop {
+                full_scale: Microamps::ZERO,
+                ..default
+            })
+            .validate(),
+            Err(FrontEndError::FullScale)
+        );
+    }
+
+    #[test]
+    fn a_broken_configuration_reads_out_of_range_and_not_0_a() {
+        let broken = FrontEnd::ClosedLoop(ClosedLoop {
+            relations: SupplyRelations {
+                k1_nanoohm_per_volt: 0,
+                ..SupplyRelations::default()
+            },
+            ..ClosedLoop::default()
+        });
+        assert_eq!(
+            broken.current(millivolts(2_501), Range::Small, FIVE),
+            Microamps(i32::MAX)
+        );
+        assert_eq!(
+            broken.current(millivolts(2_499), Range::Small, FIVE),
+            Microamps(i32::MIN)
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn current_to_voltage_and_back(
+            front_end in any_valid(), range in any_range(), supply in any_supply(), amps in -1.0..1.0_f64
+        ) {
+            let full_scale = front_end.full_scale(range).get();
+            let current = (f64::from(full_scale) * amps) as i32;
+            let volts = front_end.voltage(Microamps(current), range, supply);
+            let back = front_end.current(volts, range, supply).get();
+            let line = front_end.line(range, supply);
+            let microamps_per_microvolt = 1e3 * line.numerator as f64 / line.denominator as f64;
+            let error = f64::from(back - current).abs();
+            prop_assert!(error <= 0.501 * microamps_per_microvolt + 0.501, "{} {}", error, microamps_per_microvolt);
+        }
+
+        #[test]
+        fn voltage_to_current_and_back(
+            front_end in any_valid(), range in any_range(), supply in any_supply(), volts in 0..5_000_000
+        ) {
+            let current = front_end.current(Microvolts(volts), range, supply);
+            // Beyond ±2,147 A the type ends.
+            prop_assume!(current.get() > i32::MIN && current.get() < i32::MAX);
+            let back = front_end.voltage(current, range, supply).get();
+            let line = front_end.line(range, supply);
+            let microvolts_per_microamp = 1e-3 * line.denominator as f64 / line.numerator as f64;
+            prop_assert!(f64::from(back - volts).abs() <= 0.51 + 0.51 * microvolts_per_microamp);
+        }
+
+        #[test]
+        fn more_volts_are_more_amperes(
+            front_end in any_valid(), range in any_range(), supply in any_supply(),
+            volts in 0..5_000_000, more in 1..1_000_000
+        ) {
+            let at = |volts| front_end.current(Microvolts(volts), range, supply);
+            prop_assert!(at(volts) <= at(volts + more));
+            prop_assert!(front_end.voltage(Microamps(volts), range, supply)
+                <= front_end.voltage(Microamps(volts + more), range, supply));
+        }
+
+        #[test]
+        fn both_signs_are_treated_alike(range in any_range(), volts in 0..2_500_000) {
+            for front_end in all() {
+                let zero = front_end.zero_output(range, FIVE).get();
+                let up = front_end.current(Microvolts(zero + volts), range, FIVE);
+                let down = front_end.current(Microvolts(zero - volts), range, FIVE);
+                prop_assert_eq!(up.get(), -down.get());
+            }
+        }
+
+        #[test]
+        fn supply_matters_to_d4_alone(range in any_range(), supply in any_supply(), volts in 0..5_000_000) {
+            for front_end in &all()[..3] {
+                prop_assert_eq!(
+                    front_end.current(Microvolts(volts), range, supply),
+                    front_end.current(Microvolts(volts), range, FIVE)
+                );
+            }
+        }
+
+        #[test]
+        fn rounding_of_the_relations_costs_less_than_1_ma(
+            turns in 1..5_000_i32, sensitivity in 3e-3..20e-3_f64, share in 0.0..1.0_f64,
+            k2 in 0.4..0.6_f64, supply in any_supply(), amps in -600.0..600.0_f64
+        ) {
+            let impedance = sensitivity * f64::from(turns);
+            let (k1, m1) = (impedance * share / 5.0, impedance * (1.0 - share));
+            let vc = f64::from(supply.get()) * 1e-6;
+            let signal = (k1 * vc + m1) * amps / f64::from(turns) + k2 * vc;
+            let nanovolts = (signal * 1e9).round() as i64;
+            let sensor = FrontEnd::ClosedLoop(ClosedLoop {
+                turns,
+                relations: SupplyRelations {
+                    k1_nanoohm_per_volt: (k1 * 1e9).round() as i64,
+                    m1_nanoohm: (m1 * 1e9).round() as i64,
+                    k2_nanovolt_per_volt: (k2 * 1e9).round() as i64,
+                    m2_nanovolt: 0,
+                },
+                full_scale: Microamps::from_amps(600),
+            });
+            let line = sensor.line(Range::Small, supply);
+            let current = mul_div(nanovolts - line.zero_nanovolts, line.numerator, line.denominator);
+            prop_assert!((current as f64 - amps * 1e6).abs() < 1_000.0);
+        }
+
+        #[test]
+        fn key_factors_agree_with_the_formula(volts in 0..5_000_000, k in 900_000_000..1_100_000_000, a in -100_000..100_000) {
+            let exact = f64::from(k) * 1e-9 * f64::from(volts + a);
+            let got = KeyFactors { k_ppb: k, a: Microvolts(a) }.apply(Microvolts(volts));
+            prop_assert!((f64::from(got.get()) - exact).abs() <= 0.500_001);
+        }
+
+        #[test]
+        fn nothing_panics(front_end in any_front_end(), range in any_range(), volts: i32, supply: i32, key: [i32; 2]) {
+            let (volts, supply) = (Microvolts(volts), Microvolts(supply));
+            let _ = front_end.current(volts, range, supply);
+            let _ = front_end.voltage(Microamps(volts.get()), range, supply);
+            let _ = (front_end.output_limits_at(range, supply), front_end.meter_full_scale(range), front_end.validate());
+            let _ = KeyFactors { k_ppb: key[0], a: Microvolts(key[1]) }.apply(volts);
+        }
+    }
+}
