@@ -1,0 +1,925 @@
+//! The meter's charge against the converter's integral over the same time, with a bound that follows from the error
+//! budget.
+//!
+//! Both channels hang on the analog switch's output and then go separate ways. So the comparison finds
+//! - a break or a short in one of the two ways that makes that channel read like 0 A, or any other current,
+//! - a meter that has stopped counting (frozen AENERGY, dead crystal), within 1 s while at least
+//!   [`CompareConfig::frozen_current`] flows,
+//! - a converter that repeats itself while the current moves,
+//! - a wrong scale in one of the two, beyond the tolerances.
+//!
+//! It cannot find what both see alike: a sensor that has come off upstream of the switch and floats at 2.5 V reads 0 A
+//! in both. Only another sensor can tell that from 0 A: the small sensor's own channel against the passed one
+//! (`range::FlagPlausibility`), or the open-sensor network (`open_sensor`), which pulls an open input to a rail.
+//!
+//! # How the times are made to match
+//!
+//! A conversion is the mean over its own time. Between two usable conversions the current is interpolated; the
+//! doubt of that is half their difference times the gap, or, where conversions were spoiled in between, both
+//! magnitudes times the gap. A window ends at a meter report; its end is evaluated when the conversion that spans it
+//! has come in.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error_budget;
+use crate::front_end::PerRange;
+use crate::meter::MeterReport;
+use crate::range::Range;
+use crate::units::{Duration, Instant, Microamps, Nanocoulombs, Ppm, clamp_i64, elapsed};
+
+/// Tolerances and windows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct CompareConfig {
+    /// Length of the fast window, in ms.
+    pub fast_window_ms: u32,
+    /// Length of the slow window, in ms: it averages the quantisation away and so has the finer bound.
+    pub slow_window_ms: u32,
+    /// Share by which the channels may differ.
+    pub gain_tolerance: Ppm,
+    /// Current by which they may differ at any reading.
+    pub zero_tolerance: PerRange<Microamps>,
+    /// Share of a window that usable conversions and the short gaps between them must cover.
+    pub covered_share: Ppm,
+    /// Longest gap between usable conversions that counts as short, in ms.
+    pub short_gap_ms: u32,
+}
+
+impl CompareConfig {
+    /// Current from which on a frozen meter is found within 1 s: the converter's charge since the last count has to
+    /// exceed twice its doubt and three counts, in 80 % of that second, since conversions lag behind.
+    #[must_use]
+    pub const fn frozen_current(&self, range: Range, count: Nanocoulombs) -> Microamps {
+        // nC in 1 s are nA.
+        let counts = crate::units::div_round(count.get().saturating_mul(2 * FROZEN_COUNTS), 1_000);
+        let doubt = 2 * self.zero_tolerance.get(range).get() as i64;
+        Microamps(crate::units::clamp_i32(crate::units::mul_div(
+            doubt.saturating_add(counts),
+            5,
+            4,
+        )))
+    }
+}
+
+impl Default for CompareConfig {
+    fn default() -> Self {
+        Self {
+            fast_window_ms: 1_000,
+            slow_window_ms: 10_000,
+            gain_tolerance: error_budget::CHANNEL_GAIN_TOLERANCE,
+            zero_tolerance: error_budget::CHANNEL_ZERO_TOLERANCE,
+            covered_share: Ppm(500_000),
+            short_gap_ms: 100,
+        }
+    }
+}
+
+/// Counts that a running meter would have made for certain before it is called frozen.
+const FROZEN_COUNTS: i64 = 3;
+
+/// A conversion, as the comparison needs it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Conversion {
+    /// Begin of the time over which it averaged.
+    pub started: Instant,
+    /// End of it.
+    pub finished: Instant,
+    /// The mean current.
+    pub current: Microamps,
+    /// The range it was taken in.
+    pub range: Range,
+    /// Whether it is valid.
+    pub usable: bool,
+}
+
+/// Result of one window.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Outcome {
+    /// Too few usable conversions, or the meter did not count throughout.
+    #[default]
+    Undecided,
+    /// The charges differ by no more than the bound.
+    Agree,
+    /// They differ by more.
+    Disagree {
+        /// Meter less converter.
+        difference: Nanocoulombs,
+        /// What they may differ by.
+        bound: Nanocoulombs,
+    },
+}
+
+/// The newest findings.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct CompareReport {
+    /// Of the last complete fast window.
+    pub fast: Outcome,
+    /// Of the last complete slow window.
+    pub slow: Outcome,
+    /// The meter has not counted although the converter shows a current that it would have counted.
+    pub frozen: bool,
+    /// The meter is reported lost.
+    pub meter_lost: bool,
+    /// Fast windows that disagreed; stops at the type's end.
+    pub disagreements: u32,
+}
+
+/// What the converter has measured since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+struct Integral {
+    /// pC.
+    charge: i128,
+    /// pC by which it may differ from a meter without fault.
+    doubt: i128,
+    /// µs covered.
+    covered: u64,
+}
+
+impl Integral {
+    const fn since(&self, earlier: &Self) -> Self {
+        Self {
+            charge: self.charge.saturating_sub(earlier.charge),
+            doubt: self.doubt.saturating_sub(earlier.doubt),
+            covered: self.covered.saturating_sub(earlier.covered),
+        }
+    }
+}
+
+/// The meter's side at an instant.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+struct MeterPoint {
+    at: Instant,
+    charge: Nanocoulombs,
+    uncertainty: Nanocoulombs,
+    resolution: Nanocoulombs,
+}
+
+impl MeterPoint {
+    const fn new(at: Instant, report: &MeterReport) -> Self {
+        Self {
+            at,
+            charge: report.charge_total,
+            uncertainty: report.uncertainty,
+            resolution: report.resolution,
+        }
+    }
+}
+
+/// A window from its begin on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+struct Window {
+    meter: MeterPoint,
+    converter: Integral,
+}
+
+/// Compares the two channels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct ChannelCompare {
+    integral: Integral,
+    /// The newest usable conversion, and whether a spoiled one came after it.
+    last: Option<(Conversion, bool)>,
+    fast: Option<Window>,
+    slow: Option<Window>,
+    /// A meter point for which the conversion that spans it has not come yet.
+    pending: Option<MeterPoint>,
+    /// The charge at the meter's last count, and the converter's integral then.
+    moved: Option<(Nanocoulombs, Integral)>,
+    gaps: u32,
+    report: CompareReport,
+}
+
+impl Default for ChannelCompare {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl ChannelCompare {
+    /// Nothing compared yet.
+    #[must_use]
+    pub const fn new() -> Self {
+        Self {
+            integral: Integral {
+                charge: 0,
+                doubt: 0,
+                covered: 0,
+            },
+            last: None,
+            fast: None,
+            slow: None,
+            pending: None,
+            moved: None,
+            gaps: 0,
+            report: CompareReport {
+                fast: Outcome::Undecided,
+                slow: Outcome::Undecided,
+                frozen: false,
+                meter_lost: false,
+                disagreements: 0,
+            },
+        }
+    }
+
+    /// The newest findings.
+    #[must_use]
+    pub const fn report(&self) -> CompareReport {
+        self.report
+    }
+
+    /// Takes a conversion, usable or not.
+    pub fn on_conversion(
+        &mut self,
+        config: &CompareConfig,
+        conversion: &Conversion,
+    ) -> CompareReport {
+        if !conversion.usable {
+            if let Some((_, spoiled)) = &mut self.last {
+                *spoiled = true;
+            }
+            return self.report;
+        }
+        let Some((previous, spoiled)) = self.last else {
+            self.last = Some((*conversion, false));
+            self.pending = None;
+            return self.report;
+        };
+        if conversion.started < previous.finished || conversion.finished < conversion.started {
+            // A repeated or disordered one adds no time.
+            return self.report;
+        }
+        let (from, to) = (previous.finished, conversion.started);
+        let gap = Gap {
+            mean: Microamps(midpoint(previous.current, conversion.current)),
+            doubt: gap_doubt(config, &previous, conversion, spoiled),
+            covered: elapsed(from, to).as_millis() <= u64::from(config.short_gap_ms),
+        };
+        // A report that came later than the conversion after it: the next one will do.
+        self.pending = self.pending.filter(|point| point.at >= from);
+        let split = self.pending.filter(|point| point.at <= conversion.finished);
+        let Some(point) = split else {
+            self.span_gap(config, &gap, from, to, conversion.range);
+            self.span(config, conversion, conversion.started, conversion.finished);
+            self.last = Some((*conversion, false));
+            self.check_frozen(config);
+            return self.report;
+        };
+        let end = point.at;
+        self.span_gap(config, &gap, from, end.min(to), conversion.range);
+        self.span(config, conversion, to, end.max(to));
+        // Inside one conversion only its mean is known.
+        let step = i128::from(conversion.current.get()) - i128::from(previous.current.get());
+        let length = elapsed(from, conversion.finished);
+        let edge = step.abs() * i128::from(length.as_ticks()) / 2;
+        self.integral.doubt = self.integral.doubt.saturating_add(edge);
+        self.evaluate(config, point);
+        self.integral.doubt = self.integral.doubt.saturating_add(edge);
+        self.span_gap(config, &gap, end.min(to), to, conversion.range);
+        self.span(config, conversion, end.max(to), conversion.finished);
+        self.pending = None;
+        self.last = Some((*conversion, false));
+        self.check_frozen(config);
+        self.report
+    }
+
+    /// Takes the meter's newest report.
+    pub fn on_meter(&mut self, config: &CompareConfig, report: &MeterReport) -> CompareReport {
+        self.report.meter_lost = report.lost;
+        let Some(at) = report.at else {
+            return self.report;
+        };
+        if report.lost || report.gaps != self.gaps {
+            // What bridges a gap comes from the converter: nothing to compare.
+            self.gaps = report.gaps;
+            self.restart(report.lost);
+        }
+        if report.lost {
+            return self.report;
+        }
+        let point = MeterPoint::new(at, report);
+        match self.moved {
+            Some((charge, _)) if charge == report.charge_total => {}
+            _ => {
+                self.moved = Some((report.charge_total, self.integral));
+                self.report.frozen = false;
+            }
+        }
+        let due = |window: &Option<Window>, length_ms: u32| {
+            window.is_none_or(|window| {
+                elapsed(window.meter.at, at).as_millis() >= u64::from(length_ms)
+            })
+        };
+        match self.pending {
+            None => {
+                if due(&self.fast, config.fast_window_ms) || due(&self.slow, config.slow_window_ms)
+                {
+                    self.pending = Some(point);
+                }
+            }
+            Some(pending) => {
+                // No usable conversion for a whole window: there is nothing to wait for.
+                if elapsed(pending.at, at).as_millis() >= u64::from(config.fast_window_ms) {
+                    self.restart(false);
+                }
+            }
+        }
+        self.report
+    }
+
+    fn restart(&mut self, keep_frozen: bool) {
+        self.fast = None;
+        self.slow = None;
+        self.pending = None;
+        self.moved = None;
+        self.last = None;
+        self.report.fast = Outcome::Undecided;
+        self.report.slow = Outcome::Undecided;
+        self.report.frozen &= keep_frozen;
+    }
+
+    fn span(&mut self, config: &CompareConfig, of: &Conversion, from: Instant, to: Instant) {
+        self.add(config, of.current, of.range, elapsed(from, to), true);
+    }
+
+    fn span_gap(
+        &mut self,
+        config: &CompareConfig,
+        gap: &Gap,
+        from: Instant,
+        to: Instant,
+        range: Range,
+    ) {
+        let time = elapsed(from, to);
+        self.add(config, gap.mean, range, time, gap.covered);
+        let doubt = i128::from(gap.doubt) * i128::from(time.as_ticks());
+        self.integral.doubt = self.integral.doubt.saturating_add(doubt);
+    }
+
+    fn add(
+        &mut self,
+        config: &CompareConfig,
+        current: Microamps,
+        range: Range,
+        time: Duration,
+        covered: bool,
+    ) {
+        let ticks = i128::from(time.as_ticks());
+        let charge = i128::from(current.get()) * ticks;
+        let gain = charge.abs() / 1_000_000 * i128::from(config.gain_tolerance.get().max(0));
+        let zero = i128::from(config.zero_tolerance.get(range).get().max(0)) * ticks;
+        self.integral.charge = self.integral.charge.saturating_add(charge);
+        self.integral.doubt = self
+            .integral
+            .doubt
+            .saturating_add(gain.saturating_add(zero));
+        if covered {
+            self.integral.covered = self.integral.covered.saturating_add(time.as_ticks());
+        }
+    }
+
+    fn evaluate(&mut self, config: &CompareConfig, point: MeterPoint) {
+        let now = Window {
+            meter: point,
+            converter: self.integral,
+        };
+        if let Some(outcome) = close(&mut self.fast, &now, config.fast_window_ms, config) {
+            self.report.fast = outcome;
+            if matches!(outcome, Outcome::Disagree { .. }) {
+                self.report.disagreements = self.report.disagreements.saturating_add(1);
+            }
+        }
+        if let Some(outcome) = close(&mut self.slow, &now, config.slow_window_ms, config) {
+            self.report.slow = outcome;
+        }
+    }
+
+    /// AENERGY stands still although the converter's charge since its last count exceeds twice what the channels may
+    /// differ by: once for the bound itself and once for the conversion that was under way at that count.
+    fn check_frozen(&mut self, config: &CompareConfig) {
+        let Some((_, then)) = &self.moved else {
+            return;
+        };
+        let Some((last, _)) = &self.last else {
+            return;
+        };
+        let since = self.integral.since(then);
+        let under_way = i128::from(last.current.get()).abs()
+            * i128::from(elapsed(last.started, last.finished).as_ticks());
+        let count = self
+            .fast
+            .map_or(0, |window| i128::from(window.meter.resolution.get()));
+        let bound = since
+            .doubt
+            .saturating_add(i128::from(FROZEN_COUNTS) * count * 1_000)
+            .saturating_mul(2)
+            .saturating_add(2 * under_way);
+        if self.fast.is_some()
+            && elapsed_at_least(since.covered, config.short_gap_ms)
+            && since.charge.abs() > bound
+        {
+            self.report.frozen = true;
+        }
+    }
+}
+
+/// A gap between two usable conversions.
+#[derive(Clone, Copy)]
+struct Gap {
+    mean: Microamps,
+    /// µA by which the mean may be off.
+    doubt: i64,
+    covered: bool,
+}
+
+fn gap_doubt(
+    config: &CompareConfig,
+    before: &Conversion,
+    after: &Conversion,
+    spoiled: bool,
+) -> i64 {
+    let (a, b) = (
+        i64::from(before.current.get()),
+        i64::from(after.current.get()),
+    );
+    let length = elapsed(before.finished, after.started);
+    if spoiled || length.as_millis() > u64::from(config.short_gap_ms) {
+        a.abs() + b.abs()
+    } else {
+        (a - b).abs() / 2
+    }
+}
+
+fn midpoint(a: Microamps, b: Microamps) -> i32 {
+    a.get().midpoint(b.get())
+}
+
+const fn elapsed_at_least(micros: u64, millis: u32) -> bool {
+    micros / 1_000 >= millis as u64
+}
+
+/// Ends `window` at `now` if it is due and begins the next; `None` when it is not.
+fn close(
+    window: &mut Option<Window>,
+    now: &Window,
+    length_ms: u32,
+    config: &CompareConfig,
+) -> Option<Outcome> {
+    let Some(begun) = window else {
+        *window = Some(*now);
+        return None;
+    };
+    let length = elapsed(begun.meter.at, now.meter.at);
+    if length.as_millis() < u64::from(length_ms) {
+        return None;
+    }
+    let measured = now.converter.since(&begun.converter);
+    let share = i128::from(measured.covered) * 1_000_000;
+    let needed = i128::from(length.as_ticks()) * i128::from(config.covered_share.get());
+    let outcome = if share < needed {
+        Outcome::Undecided
+    } else {
+        let meter = now.meter.charge.saturating_sub(begun.meter.charge);
+        let difference = i128::from(meter.get()) - i128::from(clamp_i64(measured.charge / 1_000));
+        let uncertainty =
+            i128::from(now.meter.uncertainty.get()) - i128::from(begun.meter.uncertainty.get());
+        let bound = i128::from(clamp_i64(measured.doubt / 1_000))
+            + uncertainty.abs()
+            + i128::from(begun.meter.resolution.get())
+            + i128::from(now.meter.resolution.get());
+        if difference.abs() > bound {
+            Outcome::Disagree {
+                difference: Nanocoulombs(clamp_i64(difference)),
+                bound: Nanocoulombs(clamp_i64(bound)),
+            }
+        } else {
+            Outcome::Agree
+        }
+    };
+    *window = Some(*now);
+    Some(outcome)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::panic, clippy::cast_possible_truncation)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const PERIOD: u64 = 31_250;
+    const POLL: u64 = 20_000;
+
+    fn at(us: u64) -> Instant {
+        Instant::from_ticks(us)
+    }
+
+    /// Both channels on a time axis of their own, each seeing what it is made to see.
+    struct Bench {
+        compare: ChannelCompare,
+        config: CompareConfig,
+        now: u64,
+        next_conversion: u64,
+        next_meter: u64,
+        /// nC of the meter.
+        charge: i64,
+        uncertainty: i64,
+        gaps: u32,
+        range: Range,
+        usable: bool,
+    }
+
+    impl Bench {
+        fn new() -> Self {
+            Self {
+                compare: ChannelCompare::new(),
+                config: CompareConfig::default(),
+                now: 0,
+                next_conversion: PERIOD,
+                next_meter: POLL,
+                charge: 0,
+                uncertainty: 0,
+                gaps: 0,
+                range: Range::Small,
+                usable: true,
+            }
+        }
+
+        fn resolution(&self) -> Nanocoulombs {
+            error_budget::charge_per_count(self.range)
+        }
+
+        fn report(&self) -> MeterReport {
+            // The register moves in counts.
+            let count = self.resolution().get();
+            MeterReport {
+                at: Some(at(self.now)),
+                charge_total: Nanocoulombs(self.charge.div_euclid(count) * count),
+                uncertainty: Nanocoulombs(self.uncertainty),
+                resolution: self.resolution(),
+                gaps: self.gaps,
+                ..MeterReport::default()
+            }
+        }
+
+        /// Lets `ms` pass with these currents in mA; calls back after each report.
+        fn run(&mut self, ms: u64, meter_ma: i64, converter_ma: i32) -> CompareReport {
+            self.run_until(ms, meter_ma, converter_ma, |_| false);
+            self.compare.report()
+        }
+
+        /// As `run`; stops where `done` says so and returns the time since the call, in ms.
+        fn run_until(
+            &mut self,
+            ms: u64,
+            meter_ma: i64,
+            converter_ma: i32,
+            done: impl Fn(&CompareReport) -> bool,
+        ) -> Option<u64> {
+            let (begin, end) = (self.now, self.now + ms * 1_000);
+            while self.now < end {
+                let next = self.next_conversion.min(self.next_meter).min(end);
+                // mA · µs = nC.
+                self.charge += meter_ma * (next - self.now) as i64;
+                self.now = next;
+                if self.now == self.next_conversion {
+                    let conversion = Conversion {
+                        started: at(self.now - PERIOD + 300),
+                        finished: at(self.now),
+                        current: Microamps::from_milliamps(converter_ma),
+                        range: self.range,
+                        usable: self.usable,
+                    };
+                    let _ = self.compare.on_conversion(&self.config, &conversion);
+                    self.next_conversion += PERIOD;
+                }
+                if self.now == self.next_meter {
+                    let report = self.report();
+                    let _ = self.compare.on_meter(&self.config, &report);
+                    self.next_meter += POLL;
+                }
+                if done(&self.compare.report()) {
+                    return Some((self.now - begin) / 1_000);
+                }
+            }
+            None
+        }
+    }
+
+    #[test]
+    fn equal_currents_agree_in_both_windows() {
+        for current in [0, 100, -20_000, 53_000] {
+            let mut bench = Bench::new();
+            let report = bench.run(25_000, current.into(), current);
+            assert_eq!((report.fast, report.slow), (Outcome::Agree, Outcome::Agree));
+            assert!(!report.frozen && !report.meter_lost);
+            assert_eq!(report.disagreements, 0);
+        }
+    }
+
+    #[test]
+    fn a_channel_that_reads_0_a_is_found() {
+        for (meter, converter) in [(30_000, 0), (0, 30_000), (-30_000, 0)] {
+            let mut bench = Bench::new();
+            let found = bench.run_until(3_000, meter, converter, |report| {
+                matches!(report.fast, Outcome::Disagree { .. })
+            });
+            // The first window, its conversion, and the one before the first report.
+            assert!(found.unwrap() <= 1_100, "{found:?}");
+            let Outcome::Disagree { difference, bound } = bench.compare.report().fast else {
+                panic!("{:?}", bench.compare.report());
+            };
+            let expected = (meter - i64::from(converter)) * 1_000_000;
+            assert!(
+                (difference.get() - expected).abs() < 25_000_000,
+                "{difference:?}"
+            );
+            // 8 · 10⁻³ of what the converter sees, its zero, two counts.
+            let gain = 7_940 * i64::from(converter) / 1_000 * 1_000;
+            let zero = 134_805 * 1_000;
+            let counts = 2 * 6_704_762;
+            let stated = gain + zero + counts;
+            assert!(
+                (bound.get() - stated).abs() < stated / 50,
+                "{bound:?} {stated}"
+            );
+            assert_eq!(bench.compare.report().disagreements, 1);
+        }
+    }
+
+    #[test]
+    fn small_differences_are_within_the_bound_and_larger_ones_are_not() {
+        // 0.79 % of 40 A and 135 mA of zero make 453 mA; the fast window adds two counts in a second, 13 mA.
+        assert_eq!(
+            Bench::new().run(12_000, 40_400, 40_000).fast,
+            Outcome::Agree
+        );
+        assert_eq!(
+            Bench::new().run(12_000, 40_400, 40_000).slow,
+            Outcome::Agree
+        );
+        assert_eq!(
+            Bench::new().run(12_000, 40_440, 40_000).fast,
+            Outcome::Agree
+        );
+        for (meter, converter) in [(40_500, 40_000), (-40_500, -40_000), (39_500, 40_000)] {
+            let report = Bench::new().run(22_000, meter, converter);
+            assert!(
+                matches!(report.fast, Outcome::Disagree { .. }),
+                "{report:?}"
+            );
+            assert!(
+                matches!(report.slow, Outcome::Disagree { .. }),
+                "{report:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn the_meters_own_doubt_widens_the_bound() {
+        let mut bench = Bench::new();
+        let _ = bench.run(500, 20_000, 20_000);
+        bench.uncertainty = 1_000_000_000;
+        // 0.7 C in a second.
+        let report = bench.run(700, 20_700, 20_000);
+        assert_eq!(report.fast, Outcome::Agree);
+        let report = bench.run(1_500, 20_700, 20_000);
+        assert!(matches!(report.fast, Outcome::Disagree { .. }));
+    }
+
+    #[test]
+    fn a_changing_current_is_no_disagreement() {
+        let mut bench = Bench::new();
+        for step in 0..200_i32 {
+            let current = (step * 37) % 50_000 - 25_000;
+            let report = bench.run(97, current.into(), current);
+            assert!(
+                !matches!(report.fast, Outcome::Disagree { .. }),
+                "{report:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_frozen_meter_is_found_within_a_second() {
+        for range in [Range::Small, Range::Large] {
+            let mut bench = Bench::new();
+            bench.range = range;
+            let least = bench.config.frozen_current(range, bench.resolution());
+            let current = least.to_milliamps() + 1;
+            let _ = bench.run(2_500, current.into(), current);
+            assert!(!bench.compare.report().frozen);
+            let found = bench.run_until(3_000, 0, -current, |report| report.frozen);
+            assert!(found.unwrap() <= 1_000, "{found:?} ms at {current} mA");
+            assert!(found.unwrap() > 100);
+            // It counts again.
+            let report = bench.run(200, (current * 10).into(), current * 10);
+            assert!(!report.frozen);
+        }
+        // A current too small to say so.
+        let mut bench = Bench::new();
+        let report = bench.run(20_000, 0, 130);
+        assert!(!report.frozen);
+        let config = CompareConfig::default();
+        let count = error_budget::charge_per_count(Range::Small);
+        // 1.25 · (2 · 134.8 mA + 6 · 6.7 mC/s).
+        assert_eq!(
+            config.frozen_current(Range::Small, count).to_milliamps(),
+            387
+        );
+    }
+
+    #[test]
+    fn without_usable_conversions_nothing_is_decided() {
+        let mut bench = Bench::new();
+        let _ = bench.run(1_500, 10_000, 10_000);
+        assert_eq!(bench.compare.report().fast, Outcome::Agree);
+        bench.usable = false;
+        let report = bench.run(3_000, 10_000, 0);
+        assert_eq!(
+            (report.fast, report.slow),
+            (Outcome::Undecided, Outcome::Undecided)
+        );
+        bench.usable = true;
+        let report = bench.run(2_500, 10_000, 10_000);
+        assert_eq!(report.fast, Outcome::Agree);
+    }
+
+    #[test]
+    fn too_large_a_share_of_gaps_leaves_a_window_undecided() {
+        let mut bench = Bench::new();
+        bench.config.short_gap_ms = 50;
+        let outcomes = |bench: &mut Bench, every: u64| {
+            let mut last = Outcome::Agree;
+            for step in 0..120_u64 {
+                bench.usable = step % every == 0;
+                bench.run_until(31, 10_000, 10_000, |_| false);
+                last = bench.compare.report().fast;
+            }
+            last
+        };
+        // One conversion in six is 17 %.
+        assert_eq!(outcomes(&mut bench, 6), Outcome::Undecided);
+        // With every second one spoiled, half is covered and the gaps of 31 ms between.
+        assert_eq!(outcomes(&mut bench, 2), Outcome::Agree);
+    }
+
+    #[test]
+    fn spoiled_conversions_widen_the_bound_by_the_gap() {
+        let before = Conversion {
+            started: at(0),
+            finished: at(10),
+            current: Microamps(5),
+            range: Range::Small,
+            usable: true,
+        };
+        let after = Conversion {
+            started: at(20),
+            finished: at(30),
+            current: Microamps(-9),
+            ..before
+        };
+        let config = CompareConfig::default();
+        assert_eq!(gap_doubt(&config, &before, &after, false), 7);
+        assert_eq!(gap_doubt(&config, &before, &after, true), 14);
+        let late = Conversion {
+            started: at(101_010),
+            ..after
+        };
+        assert_eq!(gap_doubt(&config, &before, &late, false), 14);
+        let just = Conversion {
+            started: at(101_009),
+            ..after
+        };
+        assert_eq!(gap_doubt(&config, &before, &just, false), 7);
+        assert_eq!(midpoint(Microamps(10), Microamps(-4)), 3);
+    }
+
+    #[test]
+    fn repeated_conversions_add_no_time() {
+        let mut compare = ChannelCompare::default();
+        let config = CompareConfig::default();
+        let conversion = |started, finished| Conversion {
+            started: at(started),
+            finished: at(finished),
+            current: Microamps(1_000),
+            range: Range::Small,
+            usable: true,
+        };
+        let _ = compare.on_conversion(&config, &conversion(0, 100));
+        let _ = compare.on_conversion(&config, &conversion(100, 200));
+        let once = compare.integral;
+        assert_eq!((once.charge, once.covered), (100_000, 100));
+        let _ = compare.on_conversion(&config, &conversion(100, 200));
+        let _ = compare.on_conversion(&config, &conversion(300, 250));
+        assert_eq!(compare.integral, once);
+        // A gap is interpolated.
+        let _ = compare.on_conversion(&config, &conversion(250, 300));
+        assert_eq!(compare.integral.covered, 200);
+        assert_eq!(compare.integral.charge, 200_000);
+    }
+
+    #[test]
+    fn a_report_that_comes_late_is_passed_over() {
+        let mut bench = Bench::new();
+        let _ = bench.run(500, 20_000, 20_000);
+        // Of an instant before the newest conversion, and with a charge that would disagree.
+        bench.compare.fast = None;
+        let late = MeterReport {
+            at: Some(at(bench.now - 60_000)),
+            charge_total: Nanocoulombs(0),
+            ..bench.report()
+        };
+        let _ = bench.compare.on_meter(&bench.config, &late);
+        assert!(bench.compare.pending.is_some());
+        let report = bench.run(2_000, 20_000, 20_000);
+        assert_eq!((report.fast, report.disagreements), (Outcome::Agree, 0));
+    }
+
+    #[test]
+    fn a_lost_meter_and_a_bridged_gap_are_not_compared() {
+        let mut bench = Bench::new();
+        let _ = bench.run(2_500, 10_000, 10_000);
+        let lost = MeterReport {
+            lost: true,
+            ..bench.report()
+        };
+        let report = bench.compare.on_meter(&bench.config, &lost);
+        assert!(report.meter_lost);
+        assert_eq!(report.fast, Outcome::Undecided);
+        // Restarted: what lay in the gap is the converter's own.
+        bench.gaps = 1;
+        bench.charge += 50_000_000_000;
+        let report = bench.run(900, 10_000, 10_000);
+        assert!(!report.meter_lost);
+        assert_eq!(report.fast, Outcome::Undecided);
+        let report = bench.run(1_500, 10_000, 10_000);
+        assert_eq!(report.fast, Outcome::Agree);
+        assert_eq!(report.disagreements, 0);
+        // A meter that never counted says nothing.
+        let mut compare = ChannelCompare::new();
+        let report = compare.on_meter(&bench.config, &MeterReport::default());
+        assert_eq!(report, CompareReport::default());
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(40))]
+
+        /// Both see the same current, whatever it does: no disagreement, never frozen.
+        #[test]
+        fn alike_channels_never_disagree(
+            steps in prop::collection::vec((-50_000..50_000_i32, 1_u64..2_000), 1..30),
+        ) {
+            let mut bench = Bench::new();
+            for (current, ms) in steps {
+                // Whole conversions, so that each is a mean of one current.
+                let ms = ms.div_ceil(125) * 125;
+                let report = bench.run(ms, current.into(), current);
+                prop_assert!(!matches!(report.fast, Outcome::Disagree { .. }), "{:?}", report);
+                prop_assert!(!matches!(report.slow, Outcome::Disagree { .. }), "{:?}", report);
+                prop_assert!(!report.frozen);
+            }
+        }
+
+        #[test]
+        fn no_input_panics(
+            words in prop::array::uniform5(any::<u32>()),
+            signed in prop::array::uniform4(any::<i32>()),
+            inputs in prop::collection::vec(
+                (any::<[u64; 3]>(), any::<[i64; 3]>(), any::<i32>(), any::<[bool; 4]>(), any::<u32>()), 1..12),
+        ) {
+            let config = CompareConfig {
+                fast_window_ms: words[0],
+                slow_window_ms: words[1],
+                gain_tolerance: Ppm(signed[0]),
+                zero_tolerance: PerRange { small: Microamps(signed[1]), large: Microamps(signed[2]) },
+                covered_share: Ppm(signed[3]),
+                short_gap_ms: words[2],
+            };
+            let _ = config.frozen_current(Range::Small, Nanocoulombs(i64::from(signed[0]) << 32));
+            let mut compare = ChannelCompare::new();
+            for (times, charges, current, flags, gaps) in inputs {
+                let _ = compare.on_conversion(&config, &Conversion {
+                    started: at(times[0]),
+                    finished: at(times[1]),
+                    current: Microamps(current),
+                    range: Range::from_flag(flags[0]),
+                    usable: flags[1],
+                });
+                let _ = compare.on_meter(&config, &MeterReport {
+                    at: flags[2].then_some(at(times[2])),
+                    charge_total: Nanocoulombs(charges[0]),
+                    uncertainty: Nanocoulombs(charges[1]),
+                    resolution: Nanocoulombs(charges[2]),
+                    lost: flags[3],
+                    gaps: gaps % 2,
+                    ..MeterReport::default()
+                });
+            }
+        }
+    }
+}
