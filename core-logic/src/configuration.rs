@@ -1,0 +1,1181 @@
+//! The whole configuration of the board: one plain value, its limits, its record in flash and its change at run time.
+//!
+//! **Record**: version (2 bytes), length of the payload (2), payload, CRC-32/ISO-HDLC over all of that (4); numbers least
+//! significant byte first. The payload is every value of [`FIELDS`] that is in use, in that order, as a signed postcard
+//! number. So one table is limits, register map and format at once, and costs half the flash of derived serialisers (for
+//! the target, this module, `modbus` and `modbus_rtu`: 19 KiB in place of 40). [`decode`] takes a record only whole, and
+//! only when every value lies in its limits and none contradicts another; otherwise it says why and the caller keeps what
+//! it had.
+//!
+//! **Change**: [`ConfigurationStore::stage`] hands out a copy, [`ConfigurationStore::commit`] judges it whole and then
+//! puts it in force. So a refused change leaves nothing behind, whether it came over Modbus or from flash.
+//!
+//! **In memory**: the active configuration carries its CRC. [`ConfigurationStore::verify`], called at least once a
+//! second, replaces a corrupted one by the factory's and says so; a corrupted one is never the base of a change.
+
+mod fields;
+
+use core::fmt;
+
+use crc::{CRC_32_ISO_HDLC, Crc, NoTable};
+use serde::{Deserialize, Serialize};
+
+use crate::design_parameters::{TEMPERATURE_HIGH, TEMPERATURE_LOW};
+use crate::front_end::PerRange;
+use crate::range::Range;
+use crate::storm::StormConfig;
+use crate::units::{Microamps, MilliCelsius, Ppm};
+pub use fields::{FIELD_TEXTS, FIELDS, Field, FieldId, When};
+
+/// Version of the record. It changes with every change of [`Configuration`]'s shape.
+pub const VERSION: u16 = 1;
+/// Bytes before the payload: version and length.
+pub const HEADER: usize = 4;
+/// Bytes behind the payload.
+pub const TRAILER: usize = 4;
+/// Largest payload that any configuration makes, whatever its values; a test works it out.
+pub const MAX_PAYLOAD: usize = 520;
+/// Largest record: what the flash buffer must hold.
+pub const MAX_RECORD: usize = HEADER + MAX_PAYLOAD + TRAILER;
+
+/// Without a table: a record is written and checked too rarely to be worth 1 KiB of flash.
+static CRC: Crc<u32, NoTable> = Crc::<u32, NoTable>::new(&CRC_32_ISO_HDLC);
+
+/// Two settings that cannot both be meant, each as its module judges it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Contradiction {
+    /// The front end refuses its parameters.
+    FrontEnd(crate::front_end::FrontEndError),
+    /// The converter refuses its parameters.
+    Converter(crate::converter::ConverterConfigError),
+    /// The zero drift in use is beyond its own limit.
+    ZeroDrift,
+    /// The threshold of the open sensor does not lie below every legal level.
+    OpenSensor,
+    /// What a part repeats of another one ([`Configuration::derive`]) differs from it.
+    Derived,
+    /// The lowest temperature is not below the highest.
+    Temperature,
+    /// The key calibration's longest delay does not leave time to settle.
+    KeyCalibrationDelay,
+    /// The slow window of the channels' comparison is not longer than the fast one.
+    CompareWindows,
+    /// The open-circuit table is not usable.
+    Ocv(crate::ocv::OcvTableError),
+}
+
+/// Why a configuration may not be used.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Violation {
+    /// A value lies outside its limits.
+    OutOfLimits {
+        /// Which value.
+        field: FieldId,
+        /// What it is.
+        value: i64,
+        /// Smallest allowed.
+        min: i64,
+        /// Largest allowed.
+        max: i64,
+    },
+    /// The value belongs to another front end than the one set.
+    NotInUse(FieldId),
+    /// Two values contradict each other.
+    Contradiction(Contradiction),
+}
+
+impl fmt::Display for Violation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::OutOfLimits {
+                field,
+                value,
+                min,
+                max,
+            } => write!(f, "{field} is {value}, its limits are {min} and {max}"),
+            Self::NotInUse(field) => write!(f, "{field} does not belong to the front end in use"),
+            Self::Contradiction(Contradiction::Ocv(error)) => {
+                write!(f, "open-circuit table: {error}")
+            }
+            Self::Contradiction(contradiction) => write!(f, "contradiction: {contradiction:?}"),
+        }
+    }
+}
+
+impl core::error::Error for Violation {}
+
+/// Why a record was refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ConfigurationError {
+    /// Fewer bytes than the record announces, or than any record has.
+    TooShort {
+        /// Bytes that the record needs, as far as that is known.
+        needed: usize,
+        /// Bytes there are.
+        found: usize,
+    },
+    /// Another version of the firmware wrote it.
+    WrongVersion {
+        /// The version that can be read.
+        known: u16,
+        /// The record's.
+        found: u16,
+    },
+    /// Bytes follow the record, or the payload does not fill its length.
+    TrailingBytes(usize),
+    /// The record was damaged.
+    WrongCrc {
+        /// Of the bytes.
+        computed: u32,
+        /// The record's.
+        found: u32,
+    },
+    /// The CRC is right and the payload is none all the same.
+    Malformed,
+    /// Its values may not be used.
+    Invalid(Violation),
+}
+
+impl fmt::Display for ConfigurationError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::TooShort { needed, found } => {
+                write!(f, "{found} bytes of at least {needed}")
+            }
+            Self::WrongVersion { known, found } => {
+                write!(f, "version {found}, this firmware reads version {known}")
+            }
+            Self::TrailingBytes(count) => write!(f, "{count} bytes too many"),
+            Self::WrongCrc { computed, found } => {
+                write!(f, "CRC {found:#010x}, computed {computed:#010x}")
+            }
+            Self::Malformed => write!(f, "not a configuration"),
+            Self::Invalid(violation) => violation.fmt(f),
+        }
+    }
+}
+
+impl core::error::Error for ConfigurationError {}
+
+/// The buffer cannot hold the record; [`MAX_RECORD`] bytes always can.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BufferTooSmall;
+
+/// Every setting of the board. Plain data: each part is what its module is made from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Configuration {
+    /// The sensor that is fitted.
+    pub front_end: crate::front_end::FrontEnd,
+    /// The converter's path.
+    pub converter: crate::converter::ConverterConfig,
+    /// Correction of the converter's current, per range.
+    pub current_gain: PerRange<Ppm>,
+    /// Zero drift in use, and how it is taken.
+    pub zero_drift: crate::zero_drift::ZeroDriftConfig,
+    /// Sliding average of the current.
+    pub average: crate::sliding_average::SlidingAverageConfig,
+    /// How the factors by key state are taken.
+    pub key_calibration: crate::key_calibration::KeyCalibrationConfig,
+    /// The factors in use until some are taken; for the small sensor, which is the one selected at 0 A.
+    pub key_factors: crate::front_end::KeyFactors,
+    /// What a supply sweep must satisfy.
+    pub supply_calibration: crate::supply_calibration::SupplyCalibrationConfig,
+    /// Current of the sweep's loaded run, Ipt; 0 until a bench sets it.
+    pub supply_test_current: Microamps,
+    /// Charge from the energy meter. Its full scales follow from the front end.
+    pub meter: crate::meter::MeterConfig,
+    /// When the range flag chatters.
+    pub chatter: crate::range::ChatterConfig,
+    /// When the range flag contradicts the level. Its switching current is the meter's, its full scale the front
+    /// end's.
+    pub flag: crate::range::FlagPlausibilityConfig,
+    /// When meter and converter disagree.
+    pub compare: crate::channel_compare::CompareConfig,
+    /// When the range edge is masked.
+    pub edge_storm: StormConfig,
+    /// When the meter's interrupt is masked.
+    pub meter_line_storm: StormConfig,
+    /// When a sensor is open.
+    pub open_sensor: crate::open_sensor::OpenSensorConfig,
+    /// Lowest and highest temperature of sensors and board, beyond which it is reported.
+    pub temperature_limits: [MilliCelsius; 2],
+    /// When charge and state of charge are written to flash.
+    pub save_policy: crate::retained::SavePolicyConfig,
+    /// State of charge.
+    pub soc: crate::soc::SocConfig,
+    /// Open-circuit voltage over state of charge.
+    pub ocv: crate::ocv::OcvTable,
+    /// The board on the RS485 line.
+    pub rtu: crate::modbus_rtu::RtuConfig,
+}
+
+impl Default for Configuration {
+    /// The factory's.
+    fn default() -> Self {
+        let mut configuration = Self {
+            front_end: Default::default(),
+            converter: Default::default(),
+            current_gain: PerRange::both(Ppm::ZERO),
+            zero_drift: Default::default(),
+            average: Default::default(),
+            key_calibration: Default::default(),
+            key_factors: Default::default(),
+            supply_calibration: Default::default(),
+            supply_test_current: Microamps::ZERO,
+            meter: Default::default(),
+            chatter: Default::default(),
+            flag: Default::default(),
+            compare: Default::default(),
+            edge_storm: StormConfig::RANGE_EDGE,
+            meter_line_storm: StormConfig::METER_LINE,
+            open_sensor: Default::default(),
+            temperature_limits: [TEMPERATURE_LOW, TEMPERATURE_HIGH],
+            save_policy: Default::default(),
+            soc: Default::default(),
+            ocv: Default::default(),
+            rtu: Default::default(),
+        };
+        configuration.derive();
+        configuration
+    }
+}
+
+impl Configuration {
+    /// Judges every value and every pair of values that could contradict each other.
+    ///
+    /// # Errors
+    /// The first violation: limits in the order of [`FIELDS`], then contradictions.
+    pub fn validate(&self) -> Result<(), Violation> {
+        for (field, element, value) in self.values() {
+            field.check(element, value)?;
+        }
+        self.contradiction()
+            .map_or(Ok(()), |found| Err(Violation::Contradiction(found)))
+    }
+
+    /// Renews what a part repeats of another one, so that no client has to keep the two alike.
+    pub fn derive(&mut self) {
+        let (full_scale, switching_current, small_full_scale) = self.derived();
+        self.meter.full_scale = full_scale;
+        self.flag.switching_current = switching_current;
+        self.flag.small_full_scale = small_full_scale;
+    }
+
+    fn contradiction(&self) -> Option<Contradiction> {
+        let unless = |holds, contradiction| match holds {
+            true => Ok(()),
+            false => Err(contradiction),
+        };
+        let results = [
+            self.front_end.validate().map_err(Contradiction::FrontEnd),
+            self.converter.validate().map_err(Contradiction::Converter),
+            unless(self.zero_drift.is_valid(), Contradiction::ZeroDrift),
+            unless(
+                self.open_sensor.is_valid(&self.front_end),
+                Contradiction::OpenSensor,
+            ),
+            unless(
+                self.temperature_limits.is_sorted_by(|low, high| low < high),
+                Contradiction::Temperature,
+            ),
+            unless(
+                self.key_calibration.settle_ms < self.key_calibration.max_delay_ms,
+                Contradiction::KeyCalibrationDelay,
+            ),
+            unless(
+                self.compare.fast_window_ms < self.compare.slow_window_ms,
+                Contradiction::CompareWindows,
+            ),
+            unless(self.derived() == self.repeated(), Contradiction::Derived),
+            self.ocv.validate().map_err(Contradiction::Ocv),
+        ];
+        results.into_iter().find_map(Result::err)
+    }
+
+    /// CRC-32 over every value, those that [`Configuration::derive`] makes included.
+    #[must_use]
+    pub fn crc(&self) -> u32 {
+        let mut digest = CRC.digest();
+        for (_, _, value) in self.values() {
+            digest.update(&value.to_le_bytes());
+        }
+        let (full_scale, switching_current, small_full_scale) = self.repeated();
+        for current in [
+            full_scale.small,
+            full_scale.large,
+            switching_current,
+            small_full_scale,
+        ] {
+            digest.update(&current.get().to_le_bytes());
+        }
+        digest.finalize()
+    }
+
+    /// Every value in use, in the order of [`FIELDS`].
+    fn values(&self) -> impl Iterator<Item = (&'static Field, usize, i64)> {
+        FIELDS.iter().flat_map(move |field| {
+            (0..usize::from(field.layout.count)).filter_map(move |element| {
+                (field.get)(self, element).map(|value| (field, element, value))
+            })
+        })
+    }
+
+    /// What [`Configuration::derive`] sets.
+    const fn repeated(&self) -> (PerRange<Microamps>, Microamps, Microamps) {
+        (
+            self.meter.full_scale,
+            self.flag.switching_current,
+            self.flag.small_full_scale,
+        )
+    }
+
+    /// What it should be.
+    const fn derived(&self) -> (PerRange<Microamps>, Microamps, Microamps) {
+        (
+            PerRange {
+                small: self.front_end.meter_full_scale(Range::Small),
+                large: self.front_end.meter_full_scale(Range::Large),
+            },
+            self.meter.switching_current,
+            self.front_end.full_scale(Range::Small),
+        )
+    }
+}
+
+/// Writes the record of `configuration` to the beginning of `buffer` and returns it.
+///
+/// # Errors
+/// [`BufferTooSmall`]; the buffer's content is then undefined.
+pub fn encode<'b>(
+    configuration: &Configuration,
+    buffer: &'b mut [u8],
+) -> Result<&'b [u8], BufferTooSmall> {
+    let mut payload = 0;
+    for (_, _, value) in configuration.values() {
+        let rest = buffer.get_mut(HEADER + payload..).ok_or(BufferTooSmall)?;
+        payload += postcard::to_slice(&value, rest)
+            .map_err(|_| BufferTooSmall)?
+            .len();
+    }
+    let length = u16::try_from(payload).map_err(|_| BufferTooSmall)?;
+    let [v0, v1] = VERSION.to_le_bytes();
+    let [l0, l1] = length.to_le_bytes();
+    *buffer.first_chunk_mut::<HEADER>().ok_or(BufferTooSmall)? = [v0, v1, l0, l1];
+    let end = HEADER + payload;
+    let crc = CRC.checksum(buffer.get(..end).ok_or(BufferTooSmall)?);
+    buffer
+        .get_mut(end..)
+        .and_then(|rest| rest.first_chunk_mut::<TRAILER>())
+        .map(|trailer| *trailer = crc.to_le_bytes())
+        .ok_or(BufferTooSmall)?;
+    buffer.get(..end + TRAILER).ok_or(BufferTooSmall)
+}
+
+/// Reads a record, which `bytes` must be to the byte.
+///
+/// # Errors
+/// Why it may not be used; see [`ConfigurationError`].
+pub fn decode(bytes: &[u8]) -> Result<Configuration, ConfigurationError> {
+    let too_short = |needed| ConfigurationError::TooShort {
+        needed,
+        found: bytes.len(),
+    };
+    let (&[v0, v1, l0, l1], rest) = bytes
+        .split_first_chunk::<HEADER>()
+        .ok_or(too_short(HEADER + TRAILER))?;
+    let version = u16::from_le_bytes([v0, v1]);
+    if version != VERSION {
+        return Err(ConfigurationError::WrongVersion {
+            known: VERSION,
+            found: version,
+        });
+    }
+    let length = usize::from(u16::from_le_bytes([l0, l1]));
+    let (payload, trailer) = rest
+        .split_at_checked(length)
+        .ok_or(too_short(HEADER + length + TRAILER))?;
+    let (trailer, extra) = trailer
+        .split_first_chunk::<TRAILER>()
+        .ok_or(too_short(HEADER + length + TRAILER))?;
+    if !extra.is_empty() {
+        return Err(ConfigurationError::TrailingBytes(extra.len()));
+    }
+    let found = u32::from_le_bytes(*trailer);
+    let mut digest = CRC.digest();
+    digest.update(&[v0, v1, l0, l1]);
+    digest.update(payload);
+    let computed = digest.finalize();
+    if computed != found {
+        return Err(ConfigurationError::WrongCrc { computed, found });
+    }
+    let configuration = values_from(payload)?;
+    configuration
+        .validate()
+        .map_err(ConfigurationError::Invalid)?;
+    Ok(configuration)
+}
+
+/// The configuration whose values these are. The first one says which front end, and with it which values follow.
+fn values_from(mut payload: &[u8]) -> Result<Configuration, ConfigurationError> {
+    let mut configuration = Configuration::default();
+    for field in FIELDS {
+        for element in 0..usize::from(field.layout.count) {
+            if (field.get)(&configuration, element).is_none() {
+                continue;
+            }
+            let (value, rest) = postcard::take_from_bytes::<i64>(payload)
+                .map_err(|_| ConfigurationError::Malformed)?;
+            payload = rest;
+            field
+                .put(&mut configuration, element, value)
+                .map_err(ConfigurationError::Invalid)?;
+        }
+    }
+    match payload.len() {
+        0 => Ok(configuration),
+        extra => Err(ConfigurationError::TrailingBytes(extra)),
+    }
+}
+
+/// The memory that holds the active configuration no longer holds what was put there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Corrupted;
+
+/// Why a change was refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CommitError {
+    /// The new configuration may not be used.
+    Invalid(Violation),
+    /// The active one is damaged: [`ConfigurationStore::verify`] first.
+    Corrupted,
+}
+
+/// A configuration with the CRC that it had when it was put in force.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct GuardedConfiguration {
+    configuration: Configuration,
+    crc: u32,
+}
+
+impl GuardedConfiguration {
+    /// Seals `configuration` as it is.
+    #[must_use]
+    pub fn new(configuration: Configuration) -> Self {
+        Self {
+            crc: configuration.crc(),
+            configuration,
+        }
+    }
+
+    /// What is inside, unchecked.
+    #[must_use]
+    pub const fn get(&self) -> &Configuration {
+        &self.configuration
+    }
+
+    /// The CRC that it had.
+    #[must_use]
+    pub const fn crc(&self) -> u32 {
+        self.crc
+    }
+
+    /// Whether it still has it.
+    ///
+    /// # Errors
+    /// [`Corrupted`] when it has not.
+    pub fn verify(&self) -> Result<(), Corrupted> {
+        if self.configuration.crc() == self.crc {
+            Ok(())
+        } else {
+            Err(Corrupted)
+        }
+    }
+}
+
+/// The active configuration and the only way to change it.
+#[derive(Clone, Copy, Debug)]
+pub struct ConfigurationStore {
+    active: GuardedConfiguration,
+    generation: u32,
+}
+
+impl Default for ConfigurationStore {
+    /// The factory's configuration.
+    fn default() -> Self {
+        Self {
+            active: GuardedConfiguration::new(Configuration::default()),
+            generation: 0,
+        }
+    }
+}
+
+impl ConfigurationStore {
+    /// The configuration in force.
+    #[must_use]
+    pub const fn active(&self) -> &Configuration {
+        self.active.get()
+    }
+
+    /// CRC-32 of the configuration in force.
+    #[must_use]
+    pub const fn crc(&self) -> u32 {
+        self.active.crc()
+    }
+
+    /// Counts the changes, wrapping: who keeps something made from the configuration compares it.
+    #[must_use]
+    pub const fn generation(&self) -> u32 {
+        self.generation
+    }
+
+    /// The configuration in force, to be copied, changed and committed.
+    ///
+    /// # Errors
+    /// [`Corrupted`] when it is damaged.
+    pub fn stage(&self) -> Result<&Configuration, Corrupted> {
+        self.active.verify()?;
+        Ok(self.active.get())
+    }
+
+    /// Puts `staged` in force, if all of it may be used.
+    ///
+    /// # Errors
+    /// Why not; then nothing has changed.
+    pub fn commit(&mut self, mut staged: Configuration) -> Result<(), CommitError> {
+        self.active
+            .verify()
+            .map_err(|Corrupted| CommitError::Corrupted)?;
+        staged.derive();
+        staged.validate().map_err(CommitError::Invalid)?;
+        self.replace(staged);
+        Ok(())
+    }
+
+    /// Puts the configuration of a record in force.
+    ///
+    /// # Errors
+    /// Why not; then nothing has changed.
+    pub fn load(&mut self, record: &[u8]) -> Result<(), ConfigurationError> {
+        self.replace(decode(record)?);
+        Ok(())
+    }
+
+    /// Puts the factory's configuration in force.
+    pub fn factory_defaults(&mut self) {
+        self.replace(Configuration::default());
+    }
+
+    /// Checks the memory of the active configuration; the factory's takes the place of a damaged one.
+    ///
+    /// # Errors
+    /// [`Corrupted`] when it was damaged: a fault to report, and a change like any other for those who keep something
+    /// made from it.
+    pub fn verify(&mut self) -> Result<(), Corrupted> {
+        let result = self.active.verify();
+        if result.is_err() {
+            self.factory_defaults();
+        }
+        result
+    }
+
+    /// Flips a bit behind the store's back.
+    #[cfg(test)]
+    pub(crate) const fn corrupt(&mut self) {
+        self.active.configuration.soc.capacity_mah ^= 1 << 4;
+    }
+
+    fn replace(&mut self, configuration: Configuration) {
+        self.active = GuardedConfiguration::new(configuration);
+        self.generation = self.generation.wrapping_add(1);
+    }
+}
+
+#[cfg(test)]
+#[allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss
+)]
+mod tests {
+    use super::*;
+    use crate::modbus::register::Row;
+    use proptest::prelude::*;
+    use std::collections::BTreeSet;
+    use std::string::{String, ToString};
+    use std::vec::Vec;
+
+    /// Any value of any field, each kept only if the whole is still valid.
+    fn configuration() -> impl Strategy<Value = Configuration> {
+        let change = (any::<prop::sample::Index>(), any::<u8>(), any::<u64>());
+        (0..4i64, prop::collection::vec(change, 0..60)).prop_map(|(front_end, changes)| {
+            let mut configuration = Configuration::default();
+            assert_eq!(FIELDS[0].put(&mut configuration, 0, front_end), Ok(()));
+            for (row, element, at) in changes {
+                let field = &FIELDS[row.index(FIELDS.len())];
+                let element = usize::from(element) % usize::from(field.layout.count);
+                let span = (field.max - field.min) as u64;
+                let value = field.min.wrapping_add((at % (span + 1)) as i64);
+                let mut changed = configuration;
+                if field.put(&mut changed, element, value).is_ok() && changed.validate().is_ok() {
+                    configuration = changed;
+                }
+            }
+            configuration
+        })
+    }
+
+    fn record(configuration: &Configuration) -> Vec<u8> {
+        let mut buffer = [0; MAX_RECORD];
+        encode(configuration, &mut buffer).unwrap().to_vec()
+    }
+
+    fn sealed(payload: &[u8]) -> Vec<u8> {
+        let mut bytes = VERSION.to_le_bytes().to_vec();
+        bytes.extend((payload.len() as u16).to_le_bytes());
+        bytes.extend(payload);
+        let crc = CRC.checksum(&bytes);
+        bytes.extend(crc.to_le_bytes());
+        bytes
+    }
+
+    fn values(configuration: &Configuration) -> Vec<((u16, usize), Option<i64>)> {
+        FIELDS
+            .iter()
+            .flat_map(|field| {
+                (0..usize::from(field.layout.count)).map(|element| {
+                    (
+                        (field.layout.address, element),
+                        (field.get)(configuration, element),
+                    )
+                })
+            })
+            .collect()
+    }
+
+    fn field(address: u16) -> &'static Field {
+        FIELDS
+            .iter()
+            .find(|field| field.layout.address == address)
+            .unwrap()
+    }
+
+    #[test]
+    fn the_factory_s_configuration_is_valid_with_every_front_end() {
+        for front_end in 0..4 {
+            let mut configuration = Configuration::default();
+            field(0x0100).put(&mut configuration, 0, front_end).unwrap();
+            assert_eq!(configuration.validate(), Ok(()), "{front_end}");
+            assert_eq!((field(0x0100).get)(&configuration, 0), Some(front_end));
+            assert_eq!(decode(&record(&configuration)), Ok(configuration));
+        }
+    }
+
+    #[test]
+    fn the_table_is_in_order_and_its_limits_fit_their_types() {
+        assert_eq!(FIELDS.len(), FIELD_TEXTS.len());
+        let mut end = crate::modbus::COMMAND_ADDRESS + 1;
+        let mut names = BTreeSet::new();
+        for (field, text) in FIELDS.iter().zip(FIELD_TEXTS) {
+            let layout = field.layout();
+            assert!(layout.address >= end, "{}", text.name);
+            assert!(
+                layout.count > 0 && layout.end() > layout.address,
+                "{}",
+                text.name
+            );
+            assert!(
+                layout.kind.width() == 1 || layout.address % 2 == 0,
+                "{}",
+                text.name
+            );
+            assert!(field.min < field.max, "{}", text.name);
+            assert!(
+                field.min >= layout.kind.min() && field.max <= layout.kind.max(),
+                "{}",
+                text.name
+            );
+            assert!(
+                !text.name.is_empty() && names.insert(text.name),
+                "{}",
+                text.name
+            );
+            end = layout.end();
+        }
+    }
+
+    #[test]
+    fn each_setting_is_itself_and_no_other() {
+        for front_end in 0..4 {
+            let mut base = Configuration::default();
+            FIELDS[0].put(&mut base, 0, front_end).unwrap();
+            let before = values(&base);
+            for field in &FIELDS[1..] {
+                for element in 0..usize::from(field.layout.count) {
+                    let Some(old) = (field.get)(&base, element) else {
+                        let id = FieldId {
+                            address: field.layout.address,
+                            element,
+                        };
+                        let mut changed = base;
+                        let refused = field.put(&mut changed, element, field.min);
+                        assert_eq!(refused, Err(Violation::NotInUse(id)));
+                        assert_eq!(changed, base);
+                        continue;
+                    };
+                    for new in [field.min, field.max] {
+                        let mut changed = base;
+                        assert_eq!(field.put(&mut changed, element, new), Ok(()), "{field:?}");
+                        for (was, is) in before.iter().zip(values(&changed)) {
+                            let expected = if was.0 == (field.layout.address, element) {
+                                Some(new)
+                            } else {
+                                was.1
+                            };
+                            assert_eq!(is, (was.0, expected), "{field:?}");
+                        }
+                        assert!(changed.crc() != base.crc() || old == new);
+                    }
+                }
+                // No element behind the last.
+                let behind = usize::from(field.layout.count);
+                if behind > 1 {
+                    assert_eq!((field.get)(&base, behind), None);
+                    assert!(field.put(&mut base.clone(), behind, field.min).is_err());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_value_beyond_its_limits_is_named() {
+        for field in FIELDS {
+            for value in [field.min - 1, field.max + 1] {
+                let mut configuration = Configuration::default();
+                assert_eq!(
+                    field.put(&mut configuration, 0, value),
+                    Err(Violation::OutOfLimits {
+                        field: FieldId {
+                            address: field.layout.address,
+                            element: 0
+                        },
+                        value,
+                        min: field.min,
+                        max: field.max,
+                    })
+                );
+                assert_eq!(configuration, Configuration::default());
+            }
+        }
+        let mut configuration = Configuration::default();
+        configuration.rtu.address = 248;
+        let refused = decode(&record(&configuration)).unwrap_err();
+        assert_eq!(
+            refused.to_string(),
+            "Modbus address[0] is 248, its limits are 1 and 247"
+        );
+        assert_eq!(
+            FieldId {
+                address: 1,
+                element: 0
+            }
+            .name(),
+            "unknown"
+        );
+    }
+
+    #[test]
+    fn another_front_end_comes_with_its_defaults_and_the_same_one_keeps_its_values() {
+        let mut configuration = Configuration::default();
+        field(0x0108).put(&mut configuration, 0, 2_600_000).unwrap();
+        FIELDS[0].put(&mut configuration, 0, 0).unwrap();
+        assert_eq!((field(0x0108).get)(&configuration, 0), Some(2_600_000));
+        FIELDS[0].put(&mut configuration, 0, 1).unwrap();
+        FIELDS[0].put(&mut configuration, 0, 0).unwrap();
+        assert_eq!(configuration, Configuration::default());
+    }
+
+    #[test]
+    fn settings_that_contradict_each_other_are_refused() {
+        let mut configuration = Configuration::default();
+        field(0x0782).put(&mut configuration, 1, 0).unwrap();
+        let found = configuration.validate().unwrap_err();
+        assert_eq!(
+            found,
+            Violation::Contradiction(Contradiction::Ocv(crate::ocv::OcvTableError::SocNotRising(
+                1
+            )))
+        );
+        assert!(found.to_string().starts_with("open-circuit table: point 1"));
+        assert_eq!(
+            decode(&record(&configuration)),
+            Err(ConfigurationError::Invalid(found))
+        );
+        let mut configuration = Configuration::default();
+        // Small above large.
+        field(0x0102)
+            .put(&mut configuration, 0, 700_000_000)
+            .unwrap();
+        let found = configuration.validate().unwrap_err();
+        assert_eq!(
+            found,
+            Violation::Contradiction(Contradiction::FrontEnd(
+                crate::front_end::FrontEndError::FullScale
+            ))
+        );
+        assert_eq!(found.to_string(), "contradiction: FrontEnd(FullScale)");
+    }
+
+    #[test]
+    fn each_contradiction_is_found() {
+        type Change = fn(&mut Configuration);
+        let cases: [(Change, Contradiction); 7] = [
+            (
+                |c| c.converter.gain = crate::converter::Gain::X2,
+                Contradiction::Converter(crate::converter::ConverterConfigError::Gain),
+            ),
+            (
+                |c| c.zero_drift.value.small = Microamps(c.zero_drift.limit.small.get() + 1),
+                Contradiction::ZeroDrift,
+            ),
+            (
+                // The network's own open level is 0.148 V.
+                |c| c.open_sensor.open_below = Some(crate::units::Microvolts(100_000)),
+                Contradiction::OpenSensor,
+            ),
+            (
+                |c| c.temperature_limits = [TEMPERATURE_LOW, TEMPERATURE_LOW],
+                Contradiction::Temperature,
+            ),
+            (
+                |c| c.key_calibration.settle_ms = c.key_calibration.max_delay_ms,
+                Contradiction::KeyCalibrationDelay,
+            ),
+            (
+                |c| c.compare.fast_window_ms = c.compare.slow_window_ms,
+                Contradiction::CompareWindows,
+            ),
+            (
+                |c| c.meter.full_scale.large = Microamps(1),
+                Contradiction::Derived,
+            ),
+        ];
+        for (change, contradiction) in cases {
+            let mut configuration = Configuration::default();
+            change(&mut configuration);
+            let found = Err(Violation::Contradiction(contradiction));
+            assert_eq!(configuration.validate(), found);
+        }
+    }
+
+    #[test]
+    fn what_is_repeated_follows_its_origin() {
+        let mut configuration = Configuration::default();
+        configuration.meter.switching_current = Microamps(50_000_000);
+        configuration.front_end = crate::front_end::FrontEnd::Hah1bv(Default::default());
+        assert!(configuration.validate().is_err());
+        let mut store = ConfigurationStore::default();
+        // Whoever commits need not think of it.
+        assert_eq!(store.commit(configuration), Ok(()));
+        let active = store.active();
+        assert_eq!(
+            active.meter.full_scale,
+            PerRange::both(Microamps(562_500_000))
+        );
+        assert_eq!(active.flag.switching_current, Microamps(50_000_000));
+        assert_eq!(active.flag.small_full_scale, Microamps(500_000_000));
+    }
+
+    #[test]
+    fn every_setting_has_a_row() {
+        fn leaves(value: &serde_json::Value) -> usize {
+            match value {
+                serde_json::Value::Array(items) => items.iter().map(leaves).sum(),
+                serde_json::Value::Object(members) => members.values().map(leaves).sum(),
+                _ => 1,
+            }
+        }
+        for front_end in 0..4 {
+            let mut configuration = Configuration::default();
+            FIELDS[0].put(&mut configuration, 0, front_end).unwrap();
+            let all = leaves(&serde_json::to_value(configuration).unwrap());
+            let rows = values(&configuration)
+                .iter()
+                .filter(|(_, value)| value.is_some())
+                .count();
+            // `derive` fills four; the row `front end` is the variant's name and no leaf.
+            assert_eq!(all - 4, rows - 1, "front end {front_end}");
+        }
+    }
+
+    #[test]
+    fn the_record_has_the_documented_shape() {
+        let configuration = Configuration::default();
+        let bytes = record(&configuration);
+        assert_eq!(bytes[..2], VERSION.to_le_bytes());
+        let length = usize::from(u16::from_le_bytes([bytes[2], bytes[3]]));
+        assert_eq!(bytes.len(), length + 8);
+        let mut payload = Vec::new();
+        for (_, value) in values(&configuration) {
+            let Some(value) = value else { continue };
+            payload.extend(postcard::to_slice(&value, &mut [0; 10]).unwrap().iter());
+        }
+        assert_eq!(bytes[4..4 + length], payload);
+        assert_eq!(bytes, sealed(&payload));
+        // Check value of CRC-32/ISO-HDLC.
+        assert_eq!(CRC.checksum(b"123456789"), 0xCBF4_3926);
+    }
+
+    #[test]
+    fn every_bit_and_every_byte_of_the_record_counts() {
+        let bytes = record(&Configuration::default());
+        for bit in 0..bytes.len() * 8 {
+            let mut damaged = bytes.clone();
+            damaged[bit / 8] ^= 1 << (bit % 8);
+            let found = decode(&damaged).unwrap_err();
+            match bit / 8 {
+                0 | 1 => assert!(matches!(found, ConfigurationError::WrongVersion { .. })),
+                2 | 3 => assert!(matches!(
+                    found,
+                    ConfigurationError::TooShort { .. } | ConfigurationError::TrailingBytes(_)
+                )),
+                _ => assert!(matches!(found, ConfigurationError::WrongCrc { .. })),
+            }
+        }
+        for length in 0..bytes.len() {
+            let needed = if length < HEADER {
+                HEADER + TRAILER
+            } else {
+                bytes.len()
+            };
+            assert_eq!(
+                decode(&bytes[..length]),
+                Err(ConfigurationError::TooShort {
+                    needed,
+                    found: length
+                })
+            );
+            let mut buffer = std::vec![0; length];
+            assert_eq!(
+                encode(&Configuration::default(), &mut buffer),
+                Err(BufferTooSmall)
+            );
+        }
+        let mut exact = std::vec![0; bytes.len()];
+        assert_eq!(
+            encode(&Configuration::default(), &mut exact),
+            Ok(&bytes[..])
+        );
+        let mut longer = bytes;
+        longer.extend([0, 0]);
+        assert_eq!(decode(&longer), Err(ConfigurationError::TrailingBytes(2)));
+    }
+
+    #[test]
+    fn errors_say_what_was_expected() {
+        let texts: Vec<String> = [
+            ConfigurationError::TooShort {
+                needed: 8,
+                found: 3,
+            },
+            ConfigurationError::WrongVersion { known: 1, found: 9 },
+            ConfigurationError::TrailingBytes(2),
+            ConfigurationError::WrongCrc {
+                computed: 1,
+                found: 2,
+            },
+            ConfigurationError::Malformed,
+            ConfigurationError::Invalid(Violation::NotInUse(FieldId {
+                address: 0x0112,
+                element: 0,
+            })),
+        ]
+        .iter()
+        .map(ToString::to_string)
+        .collect();
+        assert_eq!(
+            texts,
+            [
+                "3 bytes of at least 8",
+                "version 9, this firmware reads version 1",
+                "2 bytes too many",
+                "CRC 0x00000002, computed 0x00000001",
+                "not a configuration",
+                "HAH1BV: full scale[0] does not belong to the front end in use",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_payload_that_is_none_or_too_long_is_refused_though_its_crc_is_right() {
+        // The front end alone, and a number that does not end.
+        for payload in [&[0][..], &[], &[0xFF; 11]] {
+            assert_eq!(decode(&sealed(payload)), Err(ConfigurationError::Malformed));
+        }
+        // Front end 9 does not exist.
+        let violation = Violation::OutOfLimits {
+            field: FieldId {
+                address: 0x0100,
+                element: 0,
+            },
+            value: 9,
+            min: 0,
+            max: 3,
+        };
+        assert_eq!(
+            decode(&sealed(&[18])),
+            Err(ConfigurationError::Invalid(violation))
+        );
+        let bytes = record(&Configuration::default());
+        let mut payload = bytes[HEADER..bytes.len() - TRAILER].to_vec();
+        payload.push(0);
+        assert_eq!(
+            decode(&sealed(&payload)),
+            Err(ConfigurationError::TrailingBytes(1))
+        );
+    }
+
+    #[test]
+    fn any_configuration_fits_the_record() {
+        let mut longest = 0;
+        for front_end in 0..4 {
+            // Not valid as a whole, but as long as it gets: the varint of the larger magnitude is the longer one.
+            let mut configuration = Configuration::default();
+            FIELDS[0].put(&mut configuration, 0, front_end).unwrap();
+            for field in &FIELDS[1..] {
+                for element in 0..usize::from(field.layout.count) {
+                    let largest = if field.min.unsigned_abs() > field.max.unsigned_abs() {
+                        field.min
+                    } else {
+                        field.max
+                    };
+                    let _ = field.put(&mut configuration, element, largest);
+                }
+            }
+            longest = longest.max(record(&configuration).len());
+        }
+        assert!(longest <= MAX_RECORD, "{longest}");
+        // Not far more than is needed either: the buffer is static RAM.
+        assert!(longest + 32 > MAX_RECORD, "{longest}");
+    }
+
+    #[test]
+    fn a_refused_change_leaves_everything_as_it_was() {
+        let mut store = ConfigurationStore::default();
+        let before = *store.active();
+        let mut staged = *store.stage().unwrap();
+        staged.rtu.address = 0;
+        assert!(matches!(
+            store.commit(staged),
+            Err(CommitError::Invalid(Violation::OutOfLimits {
+                value: 0,
+                min: 1,
+                ..
+            }))
+        ));
+        assert_eq!(
+            store.load(&[1, 2, 3]),
+            Err(ConfigurationError::TooShort {
+                needed: 8,
+                found: 3
+            })
+        );
+        assert_eq!((*store.active(), store.generation()), (before, 0));
+        assert_eq!(store.crc(), before.crc());
+        staged.rtu.address = 9;
+        assert_eq!(store.commit(staged), Ok(()));
+        assert_eq!((store.active().rtu.address, store.generation()), (9, 1));
+        assert_eq!(store.crc(), staged.crc());
+        assert_eq!(store.load(&record(&before)), Ok(()));
+        assert_eq!((*store.active(), store.generation()), (before, 2));
+        assert_eq!(store.verify(), Ok(()));
+        assert_eq!(store.generation(), 2);
+        store.commit(staged).unwrap();
+        store.factory_defaults();
+        assert_eq!(
+            (*store.active(), store.generation()),
+            (Configuration::default(), 4)
+        );
+    }
+
+    /// F22.
+    #[test]
+    fn a_corrupted_configuration_gives_way_to_the_factory_s_and_is_never_built_upon() {
+        let mut good = Configuration::default();
+        good.rtu.address = 17;
+        let mut store = ConfigurationStore::default();
+        store.commit(good).unwrap();
+        store.corrupt();
+        assert_eq!(store.stage(), Err(Corrupted));
+        assert_eq!(store.commit(good), Err(CommitError::Corrupted));
+        assert_eq!(store.generation(), 1);
+        assert_eq!(store.verify(), Err(Corrupted));
+        assert_eq!(*store.active(), Configuration::default());
+        assert_eq!(store.generation(), 2);
+        assert_eq!(store.verify(), Ok(()));
+        // So is what follows from other settings, and the kept CRC.
+        let currents: [fn(&mut Configuration) -> &mut Microamps; 4] = [
+            |c| &mut c.meter.full_scale.small,
+            |c| &mut c.meter.full_scale.large,
+            |c| &mut c.flag.switching_current,
+            |c| &mut c.flag.small_full_scale,
+        ];
+        for current in currents {
+            current(&mut store.active.configuration).0 ^= 1;
+            assert_eq!(store.verify(), Err(Corrupted));
+            assert_eq!(store.verify(), Ok(()));
+        }
+        store.active.crc ^= 1;
+        assert_eq!(store.verify(), Err(Corrupted));
+        assert_eq!(store.verify(), Ok(()));
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(200))]
+
+        #[test]
+        fn a_valid_configuration_survives_the_record(configuration in configuration()) {
+            prop_assert_eq!(configuration.validate(), Ok(()));
+            prop_assert_eq!(decode(&record(&configuration)), Ok(configuration));
+        }
+
+        #[test]
+        fn a_flipped_bit_is_rejected(configuration in configuration(), bit: prop::sample::Index) {
+            let mut bytes = record(&configuration);
+            let bit = bit.index(bytes.len() * 8);
+            bytes[bit / 8] ^= 1 << (bit % 8);
+            prop_assert!(decode(&bytes).is_err());
+        }
+
+        #[test]
+        fn different_configurations_have_different_checksums(a in configuration(), b in configuration()) {
+            prop_assert_eq!(a == b, a.crc() == b.crc());
+        }
+
+        #[test]
+        fn any_bytes_are_decoded_to_something_valid_or_refused(bytes in prop::collection::vec(any::<u8>(), 0..600)) {
+            for bytes in [sealed(&bytes), bytes] {
+                if let Ok(configuration) = decode(&bytes) {
+                    prop_assert_eq!(configuration.validate(), Ok(()));
+                }
+            }
+        }
+
+        #[test]
+        fn a_damaged_payload_with_a_right_crc_never_gets_past_the_limits(
+            at: prop::sample::Index,
+            with: u8,
+        ) {
+            let bytes = record(&Configuration::default());
+            let mut payload = bytes[HEADER..bytes.len() - TRAILER].to_vec();
+            let at = at.index(payload.len());
+            payload[at] = with;
+            if let Ok(configuration) = decode(&sealed(&payload)) {
+                prop_assert_eq!(configuration.validate(), Ok(()));
+            }
+        }
+    }
+}

@@ -1,0 +1,1155 @@
+//! The Modbus server of the board: one register map, declared in tables, behind function codes 03, 04, 06 and 16.
+//!
+//! Input registers are [`readings::INPUTS`], holding registers are the command register and
+//! [`crate::configuration::FIELDS`]; `docs/modbus.md` is written from the same tables.
+//!
+//! Rules, with the exception that a client sees (*MODBUS Application Protocol V1.1b3*, chapter 7):
+//!
+//! | what | exception |
+//! |---|---|
+//! | another function code | 01 illegal function |
+//! | a register that does not exist, a gap included | 02 illegal data address |
+//! | a quantity of 0 or beyond the function's limit, a length that does not fit | 03 illegal data value |
+//! | a part of a value of 32 or 64 bits, reading or writing | 03: the quantity is wrong, not the address |
+//! | a value outside its limits, or one that contradicts another setting | 03 |
+//! | a command without its key | 03 |
+//! | high voltage is on or permitted and the setting or command needs it off | 04 server device failure |
+//! | a command that the state has no use for, such as finishing a calibration that was not begun | 04 |
+//! | the active configuration failed its check | 04 |
+//! | a calibration is under way, or the flash is busy | 06 server device busy: try again |
+//!
+//! The standard has no code for "not in this state"; its state diagrams answer 04 wherever carrying out a valid
+//! request fails, and keep 06 for what a later repetition mends.
+//!
+//! A write of many registers is carried out whole or not at all: it changes a copy of the configuration, the copy is
+//! checked whole and then takes the place of the active one. Own code in place of `rmodbus`, whose server (0.13)
+//! answers an unknown function before it has looked at the CRC, and whose byte-count arithmetic overflows on a made-up
+//! length; its client is the tests' independent opposite number.
+
+pub mod readings;
+pub mod register;
+
+use heapless::Vec;
+
+use crate::configuration::{self, ConfigurationStore, FIELDS, Field, When};
+pub use readings::{Activity, CommandState, INPUTS, Readings};
+use register::{Row, locate};
+
+/// Most registers that one request may read (function 03 and 04).
+pub const MAX_READ: u16 = 125;
+/// Most registers that one request may write (function 16).
+pub const MAX_WRITE: u16 = 123;
+/// The holding register that takes commands.
+pub const COMMAND_ADDRESS: u16 = 0x0000;
+
+/// Why a request was refused; the number is the one on the wire.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[repr(u8)]
+pub enum Exception {
+    /// The function code is not supported.
+    IllegalFunction = 1,
+    /// A register does not exist.
+    IllegalDataAddress = 2,
+    /// The request's structure or a value is wrong.
+    IllegalDataValue = 3,
+    /// The state does not allow it.
+    ServerDeviceFailure = 4,
+    /// Not now: repeat it later.
+    ServerDeviceBusy = 6,
+}
+
+/// What a client can order. On the wire the upper byte is [`Command::KEY`], so that a stray number is no command.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[repr(u8)]
+pub enum Command {
+    /// Take the present reading of the selected range as its zero (D2).
+    ZeroNow = 0x01,
+    /// Take the factors of D4 anew at the next OFF and ACC.
+    StartKeyCalibration = 0x02,
+    /// Add a point at 0 A to the supply sweep (D4).
+    SupplyPointAtZero = 0x03,
+    /// Add a point at the set test current to the supply sweep (D4).
+    SupplyPointAtCurrent = 0x04,
+    /// Work out k1, m1, k2, m2 from the points and use them (D4).
+    FinishSupplyCalibration = 0x05,
+    /// End whatever calibration is under way; its previous result stays.
+    Abort = 0x06,
+    /// Write the active configuration to flash.
+    Save = 0x07,
+    /// Go back to the configuration in flash.
+    Restore = 0x08,
+    /// Use the factory's configuration; flash keeps the saved one until the next save.
+    FactoryDefaults = 0x09,
+    /// Erase the log.
+    ClearLog = 0x0A,
+    /// Clear latched diagnoses whose cause has gone.
+    ClearDiagnoses = 0x0B,
+}
+
+impl Command {
+    /// Upper byte of every command.
+    pub const KEY: u8 = 0x5A;
+
+    /// Every command, in the order of the codes, with its meaning for the documentation.
+    pub const ALL: [(Self, &'static str, &'static str); 11] = [
+        (
+            Self::ZeroNow,
+            "zero now",
+            "take the present reading of the selected range as its zero",
+        ),
+        (
+            Self::StartKeyCalibration,
+            "start key calibration",
+            "take the factors k and a anew at the next key OFF and ACC",
+        ),
+        (
+            Self::SupplyPointAtZero,
+            "supply point at 0 A",
+            "add a point at 0 A to the supply sweep; the first point begins the calibration",
+        ),
+        (
+            Self::SupplyPointAtCurrent,
+            "supply point at the test current",
+            "add a point at the set test current; the first point begins the calibration",
+        ),
+        (
+            Self::FinishSupplyCalibration,
+            "finish supply calibration",
+            "work out k1, m1, k2, m2 and use them",
+        ),
+        (
+            Self::Abort,
+            "abort",
+            "end the calibration under way, the previous result stays",
+        ),
+        (
+            Self::Save,
+            "save",
+            "write the active configuration to flash",
+        ),
+        (
+            Self::Restore,
+            "restore",
+            "go back to the saved configuration",
+        ),
+        (
+            Self::FactoryDefaults,
+            "factory defaults",
+            "use the factory's configuration, not saved until `save`",
+        ),
+        (Self::ClearLog, "clear log", "erase the log"),
+        (
+            Self::ClearDiagnoses,
+            "clear diagnoses",
+            "clear latched diagnoses whose cause has gone",
+        ),
+    ];
+
+    /// The value of the command register that orders it.
+    #[must_use]
+    pub const fn register(self) -> u16 {
+        u16::from_be_bytes([Self::KEY, self as u8])
+    }
+
+    /// The command that a value of the command register orders.
+    #[must_use]
+    pub fn from_register(value: u16) -> Option<Self> {
+        Self::ALL
+            .iter()
+            .map(|(command, ..)| *command)
+            .find(|command| command.register() == value)
+    }
+
+    /// When it is allowed.
+    #[must_use]
+    pub const fn when(self) -> CommandRule {
+        match self {
+            Self::ZeroNow | Self::StartKeyCalibration | Self::Restore | Self::FactoryDefaults => {
+                CommandRule::Idle
+            }
+            Self::SupplyPointAtZero | Self::SupplyPointAtCurrent => CommandRule::SupplySweep,
+            Self::FinishSupplyCalibration => CommandRule::SupplySweepBegun,
+            Self::Save => CommandRule::FlashFree,
+            Self::ClearLog => CommandRule::FlashFreeWithoutHighVoltage,
+            Self::Abort | Self::ClearDiagnoses => CommandRule::Always,
+        }
+    }
+}
+
+/// The state that a command needs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CommandRule {
+    /// None.
+    Always,
+    /// High voltage off, no calibration under way.
+    Idle,
+    /// High voltage off, no calibration but the supply sweep under way.
+    SupplySweep,
+    /// High voltage off, the supply sweep under way.
+    SupplySweepBegun,
+    /// Flash not busy.
+    FlashFree,
+    /// Flash not busy, high voltage off.
+    FlashFreeWithoutHighVoltage,
+}
+
+impl CommandRule {
+    /// As the documentation writes it.
+    #[must_use]
+    pub const fn text(self) -> &'static str {
+        match self {
+            Self::Always => "always",
+            Self::Idle => "high voltage off, no calibration under way",
+            Self::SupplySweep => "high voltage off, no other calibration under way",
+            Self::SupplySweepBegun => "high voltage off, supply calibration under way",
+            Self::FlashFree => "flash not busy",
+            Self::FlashFreeWithoutHighVoltage => "high voltage off, flash not busy",
+        }
+    }
+
+    fn check(self, readings: &Readings) -> Result<(), Exception> {
+        let quiet = || match readings.high_voltage() {
+            true => Err(Exception::ServerDeviceFailure),
+            false => Ok(()),
+        };
+        let flash_free = || match readings.storage_busy {
+            true => Err(Exception::ServerDeviceBusy),
+            false => Ok(()),
+        };
+        match self {
+            Self::Always => Ok(()),
+            Self::Idle => When::Standstill.check(readings),
+            Self::SupplySweep => {
+                quiet()?;
+                match readings.activity {
+                    Activity::None | Activity::SupplyCalibration => Ok(()),
+                    Activity::ZeroDrift | Activity::KeyCalibration => {
+                        Err(Exception::ServerDeviceBusy)
+                    }
+                }
+            }
+            Self::SupplySweepBegun => {
+                quiet()?;
+                match readings.activity {
+                    Activity::SupplyCalibration => Ok(()),
+                    Activity::None => Err(Exception::ServerDeviceFailure),
+                    Activity::ZeroDrift | Activity::KeyCalibration => {
+                        Err(Exception::ServerDeviceBusy)
+                    }
+                }
+            }
+            Self::FlashFree => flash_free(),
+            Self::FlashFreeWithoutHighVoltage => {
+                quiet()?;
+                flash_free()
+            }
+        }
+    }
+}
+
+impl When {
+    /// Whether the board's state allows a write.
+    fn check(self, readings: &Readings) -> Result<(), Exception> {
+        match self {
+            Self::Always => Ok(()),
+            Self::Standstill if readings.high_voltage() => Err(Exception::ServerDeviceFailure),
+            Self::Standstill if readings.activity != Activity::None => {
+                Err(Exception::ServerDeviceBusy)
+            }
+            Self::Standstill => Ok(()),
+        }
+    }
+}
+
+/// What the firmware has to do after a request.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Event {
+    /// The active configuration is another one: hand it to the owners of its parts.
+    ConfigurationChanged,
+    /// An order, its state already checked.
+    Command(Command),
+}
+
+/// What came of a request, beside the answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Outcome {
+    /// The exception that was answered.
+    pub exception: Option<Exception>,
+    /// What the firmware has to do.
+    pub event: Option<Event>,
+}
+
+/// Carries out the request `pdu` (function code and data) and appends the answer's to `reply`.
+pub fn handle<const N: usize>(
+    pdu: &[u8],
+    readings: &Readings,
+    store: &mut ConfigurationStore,
+    reply: &mut Vec<u8, N>,
+) -> Outcome {
+    let begin = reply.len();
+    match answer(pdu, readings, store, reply) {
+        Ok(event) => Outcome {
+            exception: None,
+            event,
+        },
+        Err(exception) => {
+            reply.truncate(begin);
+            let function = pdu.first().copied().unwrap_or_default();
+            let _ = reply.extend_from_slice(&[function | 0x80, exception as u8]);
+            Outcome {
+                exception: Some(exception),
+                event: None,
+            }
+        }
+    }
+}
+
+fn word(bytes: [u8; 2]) -> u16 {
+    u16::from_be_bytes(bytes)
+}
+
+fn answer<const N: usize>(
+    pdu: &[u8],
+    readings: &Readings,
+    store: &mut ConfigurationStore,
+    reply: &mut Vec<u8, N>,
+) -> Result<Option<Event>, Exception> {
+    let (function, data) = pdu.split_first().ok_or(Exception::IllegalFunction)?;
+    match function {
+        0x03 | 0x04 => {
+            let &[a, b, c, d] = data else {
+                return Err(Exception::IllegalDataValue);
+            };
+            let (address, quantity) = (word([a, b]), word([c, d]));
+            if quantity == 0 || quantity > MAX_READ {
+                return Err(Exception::IllegalDataValue);
+            }
+            let bytes = u8::try_from(quantity * 2).map_err(|_| Exception::IllegalDataValue)?;
+            put(reply, &[*function, bytes])?;
+            if *function == 0x04 {
+                read(INPUTS, address, quantity, reply, |row, element| {
+                    (row.get)(readings, element)
+                })?;
+            } else if address == COMMAND_ADDRESS {
+                if quantity != 1 {
+                    return Err(Exception::IllegalDataAddress);
+                }
+                put(reply, &readings.last_command.to_be_bytes())?;
+            } else {
+                let active = store.active();
+                read(FIELDS, address, quantity, reply, |field, element| {
+                    (field.get)(active, element).unwrap_or_default()
+                })?;
+            }
+            Ok(None)
+        }
+        0x06 => {
+            let &[a, b, c, d] = data else {
+                return Err(Exception::IllegalDataValue);
+            };
+            let event = write(word([a, b]), &[c, d], readings, store)?;
+            put(reply, pdu)?;
+            Ok(Some(event))
+        }
+        0x10 => {
+            let &[a, b, c, d, bytes, ref values @ ..] = data else {
+                return Err(Exception::IllegalDataValue);
+            };
+            let quantity = word([c, d]);
+            if quantity == 0
+                || quantity > MAX_WRITE
+                || u16::from(bytes) != quantity * 2
+                || values.len() != usize::from(bytes)
+            {
+                return Err(Exception::IllegalDataValue);
+            }
+            let event = write(word([a, b]), values, readings, store)?;
+            put(reply, &[*function, a, b, c, d])?;
+            Ok(Some(event))
+        }
+        _ => Err(Exception::IllegalFunction),
+    }
+}
+
+/// The answer's buffer holds any answer that the limits allow; should it not, the client is told.
+fn put<const N: usize>(reply: &mut Vec<u8, N>, bytes: &[u8]) -> Result<(), Exception> {
+    reply
+        .extend_from_slice(bytes)
+        .map_err(|_| Exception::ServerDeviceFailure)
+}
+
+/// Checks that `quantity` registers from `address` exist and are whole values, and hands each value's row and index to
+/// `each`. Addresses are judged first, as the standard's state diagrams do.
+fn for_each<R: Row>(
+    table: &'static [R],
+    address: u16,
+    quantity: u16,
+    mut each: impl FnMut(&'static R, usize) -> Result<(), Exception>,
+) -> Result<(), Exception> {
+    let end = address
+        .checked_add(quantity)
+        .ok_or(Exception::IllegalDataAddress)?;
+    let mut whole = true;
+    for register in address..end {
+        let (row, place) = locate(table, register).ok_or(Exception::IllegalDataAddress)?;
+        let last_word = row.layout().kind.width() - 1;
+        if (register == address && place.word != 0)
+            || (end - register == 1 && place.word != last_word)
+        {
+            whole = false;
+        }
+    }
+    if !whole {
+        return Err(Exception::IllegalDataValue);
+    }
+    let mut register = address;
+    while register < end {
+        let (row, place) = locate(table, register).ok_or(Exception::IllegalDataAddress)?;
+        each(row, place.element)?;
+        register = register.saturating_add(row.layout().kind.width());
+    }
+    Ok(())
+}
+
+fn read<R: Row, const N: usize>(
+    table: &'static [R],
+    address: u16,
+    quantity: u16,
+    reply: &mut Vec<u8, N>,
+    value: impl Fn(&R, usize) -> i64,
+) -> Result<(), Exception> {
+    for_each(table, address, quantity, |row, element| {
+        let kind = row.layout().kind;
+        let value = value(row, element);
+        for word in 0..kind.width() {
+            put(reply, &kind.word(value, word).to_be_bytes())?;
+        }
+        Ok(())
+    })
+}
+
+fn write(
+    address: u16,
+    values: &[u8],
+    readings: &Readings,
+    store: &mut ConfigurationStore,
+) -> Result<Event, Exception> {
+    if address == COMMAND_ADDRESS {
+        return command(values, readings);
+    }
+    let quantity = u16::try_from(values.len() / 2).map_err(|_| Exception::IllegalDataValue)?;
+    let mut staged = *store.stage().map_err(|_| Exception::ServerDeviceFailure)?;
+    for_each(FIELDS, address, quantity, |field: &Field, _| {
+        field.when.check(readings)
+    })?;
+    let mut words = values
+        .iter()
+        .zip(values.iter().skip(1))
+        .step_by(2)
+        .map(|(high, low)| word([*high, *low]));
+    for_each(FIELDS, address, quantity, |field: &Field, element| {
+        let kind = field.layout.kind;
+        let bits = words
+            .by_ref()
+            .take(usize::from(kind.width()))
+            .fold(0, |bits, word| bits << 16 | u64::from(word));
+        field
+            .put(&mut staged, element, kind.value(bits))
+            .map_err(|_: configuration::Violation| Exception::IllegalDataValue)
+    })?;
+    store
+        .commit(staged)
+        .map_err(|_| Exception::IllegalDataValue)?;
+    Ok(Event::ConfigurationChanged)
+}
+
+fn command(values: &[u8], readings: &Readings) -> Result<Event, Exception> {
+    // No register follows the command register.
+    let &[high, low] = values else {
+        return Err(Exception::IllegalDataAddress);
+    };
+    let command = Command::from_register(word([high, low])).ok_or(Exception::IllegalDataValue)?;
+    command.when().check(readings)?;
+    Ok(Event::Command(command))
+}
+
+#[cfg(test)]
+#[allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss
+)]
+mod tests {
+    use super::readings::INPUT_TEXTS;
+    use super::*;
+    use crate::configuration::Configuration;
+    use proptest::prelude::*;
+    use std::collections::BTreeSet;
+    use std::vec::Vec as Bytes;
+
+    const CAPACITY: u16 = 0x0700;
+    const ADDRESS: u16 = 0x0900;
+    const FRONT_END: u16 = 0x0100;
+
+    struct Board {
+        readings: Readings,
+        store: ConfigurationStore,
+    }
+
+    impl Board {
+        fn new() -> Self {
+            Self {
+                readings: Readings::default(),
+                store: ConfigurationStore::default(),
+            }
+        }
+
+        fn ask(&mut self, pdu: &[u8]) -> (Bytes<u8>, Outcome) {
+            let mut reply = Vec::<u8, 253>::new();
+            let outcome = handle(pdu, &self.readings, &mut self.store, &mut reply);
+            (reply.to_vec(), outcome)
+        }
+
+        fn read(&mut self, function: u8, address: u16, quantity: u16) -> Result<Bytes<u16>, u8> {
+            let [a, b] = address.to_be_bytes();
+            let [c, d] = quantity.to_be_bytes();
+            let (reply, outcome) = self.ask(&[function, a, b, c, d]);
+            assert_eq!(outcome.event, None);
+            if reply[0] == function | 0x80 {
+                assert_eq!(reply.len(), 2);
+                assert_eq!(outcome.exception.map(|e| e as u8), Some(reply[1]));
+                return Err(reply[1]);
+            }
+            assert_eq!(outcome.exception, None);
+            assert_eq!(reply[..2], [function, (quantity * 2) as u8]);
+            Ok(reply[2..]
+                .chunks(2)
+                .map(|pair| u16::from_be_bytes([pair[0], pair[1]]))
+                .collect())
+        }
+
+        fn write_many(&mut self, address: u16, words: &[u16]) -> Result<Option<Event>, u8> {
+            let mut pdu = std::vec![0x10];
+            pdu.extend(address.to_be_bytes());
+            pdu.extend((words.len() as u16).to_be_bytes());
+            pdu.push((words.len() * 2) as u8);
+            pdu.extend(words.iter().flat_map(|word| word.to_be_bytes()));
+            let (reply, outcome) = self.ask(&pdu);
+            if reply[0] == 0x90 {
+                assert_eq!((reply.len(), outcome.event), (2, None));
+                return Err(reply[1]);
+            }
+            assert_eq!(reply, pdu[..5]);
+            Ok(outcome.event)
+        }
+
+        fn write_one(&mut self, address: u16, word: u16) -> Result<Option<Event>, u8> {
+            let [a, b] = address.to_be_bytes();
+            let [c, d] = word.to_be_bytes();
+            let pdu = [0x06, a, b, c, d];
+            let (reply, outcome) = self.ask(&pdu);
+            if reply[0] == 0x86 {
+                assert_eq!((reply.len(), outcome.event), (2, None));
+                return Err(reply[1]);
+            }
+            assert_eq!(reply, pdu);
+            Ok(outcome.event)
+        }
+    }
+
+    fn changed() -> Result<Option<Event>, u8> {
+        Ok(Some(Event::ConfigurationChanged))
+    }
+
+    fn readings() -> Readings {
+        Readings {
+            firmware_version: [1, 2, 3],
+            unique_id: [10, 11, 12],
+            uptime_s: 0x0001_0002,
+            activity: Activity::SupplyCalibration,
+            command_state: CommandState::Failed,
+            last_command: 0x5A07,
+            current: crate::units::Microamps(-1_500_400),
+            charge: crate::units::Nanocoulombs(-4_000_000_499),
+            range: crate::range::Range::Large,
+            diagnoses_active: 1 << 63 | 5,
+            last_codes: [9, 8, 7, 6, 5, 4, 3, 255],
+            rs485_counters: [1, 2, 3, 4, 5, 6, 7, 8, u32::MAX],
+            current_validity: crate::validity::Validity::OPEN,
+            configuration_saved: true,
+            ..Readings::default()
+        }
+    }
+
+    #[test]
+    fn the_tables_are_in_order_without_overlap() {
+        assert_eq!(INPUTS.len(), INPUT_TEXTS.len());
+        let mut end = 0;
+        let mut names = BTreeSet::new();
+        for (row, text) in INPUTS.iter().zip(INPUT_TEXTS) {
+            let layout = row.layout;
+            assert!(layout.address >= end && layout.count > 0, "{}", text.name);
+            assert!(
+                layout.kind.width() == 1 || layout.address % 2 == 0,
+                "{}",
+                text.name
+            );
+            assert!(names.insert(text.name), "{}", text.name);
+            end = layout.end();
+        }
+    }
+
+    #[test]
+    fn each_input_register_reads_its_quantity() {
+        let mut board = Board::new();
+        board.readings = readings();
+        assert_eq!(board.read(4, 0x0000, 4), Ok([0x0100, 1, 2, 3].to_vec()));
+        assert_eq!(board.read(4, 0x0006, 6), Ok([0, 10, 0, 11, 0, 12].to_vec()));
+        assert_eq!(
+            board.read(4, 0x000C, 1),
+            Ok([configuration::VERSION].to_vec())
+        );
+        assert_eq!(board.read(4, 0x000E, 2), Ok([1, 2].to_vec()));
+        assert_eq!(board.read(4, 0x0020, 4), Ok([3, 0, 0x5A07, 3].to_vec()));
+        assert_eq!(board.read(4, 0x002C, 2), Ok([1, 0].to_vec()));
+        // −1,500 mA.
+        assert_eq!(board.read(4, 0x0040, 2), Ok([0xFFFF, 0xFA24].to_vec()));
+        assert_eq!(board.read(4, 0x0046, 4), Ok([8, 0, 0, 1].to_vec()));
+        // −4,000 mC.
+        assert_eq!(
+            board.read(4, 0x0060, 4),
+            Ok([0xFFFF, 0xFFFF, 0xFFFF, 0xF060].to_vec())
+        );
+        assert_eq!(board.read(4, 0x00C0, 4), Ok([0x8000, 0, 0, 5].to_vec()));
+        assert_eq!(
+            board.read(4, 0x00C8, 8),
+            Ok([9, 8, 7, 6, 5, 4, 3, 255].to_vec())
+        );
+        assert_eq!(board.read(4, 0x0140, 2), Ok([0xFFFF, 0xFFFF].to_vec()));
+        // Every row, all of it, in one request.
+        for row in INPUTS {
+            let words = row.layout.kind.width() * row.layout.count;
+            let got = board.read(4, row.layout.address, words).unwrap();
+            let mut expected = Bytes::new();
+            for element in 0..usize::from(row.layout.count) {
+                let value = (row.get)(&board.readings, element);
+                expected
+                    .extend((0..row.layout.kind.width()).map(|w| row.layout.kind.word(value, w)));
+            }
+            assert_eq!(got, expected);
+            // An index that no request can make reads nothing.
+            if row.layout.count > 1 {
+                assert_eq!((row.get)(&board.readings, usize::from(row.layout.count)), 0);
+            }
+        }
+    }
+
+    #[test]
+    fn no_two_input_rows_read_the_same_member() {
+        // Each member set alone must show in exactly the rows that are made from it.
+        macro_rules! shows {
+            ($($member:ident = $value:expr => [$($address:literal),*];)*) => {
+                $({
+                    let set = Readings { $member: $value, ..Readings::default() };
+                    let shown: Bytes<u16> = INPUTS
+                        .iter()
+                        .filter(|row| {
+                            (0..usize::from(row.layout.count))
+                                .any(|i| (row.get)(&set, i) != (row.get)(&Readings::default(), i))
+                        })
+                        .map(|row| row.layout.address)
+                        .collect();
+                    assert_eq!(shown, [$($address),*], stringify!($member));
+                })*
+            };
+        }
+        use crate::units::*;
+        let bad = crate::validity::Validity::STALE;
+        shows! {
+            firmware_version = [0, 0, 1] => [0x0001];
+            revision = 1 => [0x0004];
+            unique_id = [0, 1, 0] => [0x0006];
+            reset_cause = 1 => [0x000D];
+            uptime_s = 1 => [0x000E];
+            resets = 1 => [0x0010];
+            panic_hash = 1 => [0x0012];
+            stack_high_water = 1 => [0x0014];
+            snapshot_latency_us = 1 => [0x0016];
+            activity = Activity::ZeroDrift => [0x0020];
+            activity_progress = 1 => [0x0021];
+            last_command = 1 => [0x0022];
+            command_state = CommandState::Running => [0x0023];
+            command_reason = 1 => [0x0024];
+            supply_points = [0, 1] => [0x0025];
+            key_calibration_state = 1 => [0x0027];
+            configuration_generation = 1 => [0x0028];
+            configuration_crc = 1 => [0x002A];
+            configuration_saved = true => [0x002C];
+            storage_busy = true => [0x002D];
+            current = Microamps(1_000_000) => [0x0040, 0x0054];
+            current_average = Microamps(1_000_000) => [0x0042];
+            meter_current = Microamps(1_000_000) => [0x0044, 0x0056];
+            current_validity = bad => [0x0046];
+            average_validity = bad => [0x0047];
+            charge_validity = bad => [0x0048];
+            range = crate::range::Range::Large => [0x0049];
+            conversions = 1 => [0x004A];
+            sensor_voltage = Microvolts(1) => [0x004C];
+            range_edges = 1 => [0x004E];
+            coalesced_edges = 1 => [0x0050];
+            chatter = 1 => [0x0052];
+            charge = Nanocoulombs(500_000) => [0x0060];
+            charge_in = Nanocoulombs(1_000_000) => [0x0064];
+            charge_out = Nanocoulombs(1_000_000) => [0x0068];
+            charge_uncertainty = Nanocoulombs(1_000_000) => [0x006C];
+            channel_difference = Nanocoulombs(1_000_000) => [0x0070];
+            channel_bound = Nanocoulombs(1_000_000) => [0x0074];
+            estimated_intervals = 1 => [0x0078];
+            soc = Ppm(1) => [0x0080];
+            soc_uncertainty = Ppm(1) => [0x0082];
+            soc_validity = bad => [0x0084];
+            cell_validity = bad => [0x0085];
+            remaining_charge = Nanocoulombs(1_000_000) => [0x0086];
+            soc_anchors = 1 => [0x008A];
+            cell_voltage = Millivolts(1) => [0x008C];
+            pack_voltage = Millivolts(1) => [0x008E];
+            supply = Microvolts(1) => [0x00A0];
+            network_voltage = Microvolts(1) => [0x00A2];
+            mcu_supply = Millivolts(1) => [0x00A4];
+            sensor_temperature = MilliCelsius(1) => [0x00A6];
+            board_temperature = MilliCelsius(1) => [0x00A8];
+            supply_validity = bad => [0x00AA];
+            temperature_validity = bad => [0x00AB];
+            key_state = 1 => [0x00AC];
+            high_voltage_on = true => [0x00AD];
+            high_voltage_permit = true => [0x00AE];
+            diagnoses_active = 1 => [0x00C0];
+            diagnoses_latched = 1 => [0x00C4];
+            last_codes = [0, 0, 0, 0, 0, 0, 0, 1] => [0x00C8];
+            meter_counters = [0, 0, 0, 0, 1] => [0x0100];
+            converter_counters = [0, 0, 0, 0, 1] => [0x0110];
+            can_counters = [0, 0, 0, 0, 0, 1] => [0x0120];
+            rs485_counters = [0, 0, 0, 0, 0, 0, 0, 0, 1] => [0x0130];
+            flash_counters = [0, 0, 0, 0, 1] => [0x0148];
+        }
+    }
+
+    #[test]
+    fn every_setting_can_be_read_and_written() {
+        let mut board = Board::new();
+        for field in FIELDS {
+            let words = field.layout.kind.width() * field.layout.count;
+            let got = board.read(3, field.layout.address, words).unwrap();
+            let kind = field.layout.kind;
+            let expected: Bytes<u16> = (0..usize::from(field.layout.count))
+                .flat_map(|element| {
+                    let value = (field.get)(board.store.active(), element).unwrap_or(0);
+                    (0..kind.width()).map(move |word| kind.word(value, word))
+                })
+                .collect();
+            assert_eq!(got, expected);
+            let used = (field.get)(board.store.active(), 0).is_some();
+            // What is there can be written back; what belongs to another front end cannot.
+            let answer = board.write_many(field.layout.address, &got);
+            assert_eq!(answer, if used { changed() } else { Err(3) }, "{field:?}");
+        }
+        assert_eq!(*board.store.active(), Configuration::default());
+    }
+
+    #[test]
+    fn both_halves_of_a_wide_value_come_in_one_request() {
+        let mut board = Board::new();
+        let before = *board.store.active();
+        // 1,000,000 mAh = 0x000F_4240.
+        assert_eq!(board.write_one(CAPACITY, 0x000F), Err(3));
+        assert_eq!(board.write_one(CAPACITY + 1, 0x4240), Err(3));
+        assert_eq!(board.write_many(CAPACITY + 1, &[0x4240]), Err(3));
+        assert_eq!(board.write_many(CAPACITY, &[0x000F]), Err(3));
+        assert_eq!(board.write_many(CAPACITY, &[0x000F, 0x4240, 0]), Err(3));
+        assert_eq!(board.write_many(CAPACITY + 1, &[0x4240, 0, 1]), Err(3));
+        assert_eq!(
+            (*board.store.active(), board.store.generation()),
+            (before, 0)
+        );
+        assert_eq!(board.write_many(CAPACITY, &[0x000F, 0x4240]), changed());
+        assert_eq!(board.store.active().soc.capacity_mah, 1_000_000);
+        assert_eq!(board.read(3, CAPACITY, 1), Err(3));
+        assert_eq!(board.read(3, CAPACITY + 1, 1), Err(3));
+        assert_eq!(board.read(3, CAPACITY + 1, 2), Err(3));
+        assert_eq!(board.read(3, CAPACITY, 2), Ok([0x000F, 0x4240].to_vec()));
+        assert_eq!(board.read(4, 0x0060, 3), Err(3));
+        assert_eq!(board.read(4, 0x0061, 3), Err(3));
+    }
+
+    #[test]
+    fn a_write_of_many_is_carried_out_whole_or_not_at_all() {
+        let mut board = Board::new();
+        let before = *board.store.active();
+        // Address 5 is good, a turnaround of 50,001 µs is not.
+        assert_eq!(board.write_many(ADDRESS, &[5, 50_001]), Err(3));
+        // The gap behind it.
+        assert_eq!(board.write_many(ADDRESS, &[5, 3_000, 0]), Err(2));
+        assert_eq!(
+            (*board.store.active(), board.store.generation()),
+            (before, 0)
+        );
+        assert_eq!(board.write_many(ADDRESS, &[5, 50_000]), changed());
+        assert_eq!(board.store.active().rtu.address, 5);
+        assert_eq!(board.store.active().rtu.turnaround_us, 50_000);
+        assert_eq!(board.write_one(ADDRESS, 0), Err(3));
+        assert_eq!(board.write_one(ADDRESS, 248), Err(3));
+        assert_eq!(board.write_one(ADDRESS, 247), changed());
+        assert_eq!(board.store.generation(), 2);
+        // In limits, but the points do not rise.
+        assert_eq!(board.write_many(0x0782, &[0, 5, 0, 5]), Err(3));
+        assert_eq!(board.store.generation(), 2);
+    }
+
+    #[test]
+    fn the_parameters_of_another_front_end_are_written_with_it() {
+        let mut board = Board::new();
+        assert_eq!(board.write_many(0x0112, &[0x17D7, 0x8400]), Err(3));
+        assert_eq!(board.write_one(FRONT_END, 4), Err(3));
+        assert_eq!(board.write_one(FRONT_END, 1), changed());
+        assert_eq!(board.write_many(0x0112, &[0x17D7, 0x8400]), changed());
+        assert_eq!(
+            board
+                .store
+                .active()
+                .front_end
+                .full_scale(crate::range::Range::Small),
+            crate::units::Microamps::from_amps(400)
+        );
+        // The meter follows the front end by itself: 2.25 V / 4 mV/A.
+        assert_eq!(
+            board.store.active().meter.full_scale.small,
+            crate::units::Microamps(562_500_000)
+        );
+    }
+
+    #[test]
+    fn what_is_not_there_is_an_illegal_address() {
+        let mut board = Board::new();
+        for (function, address, quantity) in [
+            (3, 1, 1),
+            (3, 0, 2),
+            (3, 0x00FF, 1),
+            (3, 0x0101, 1),
+            (3, 0x0100, 2),
+            (3, 0xFFFF, 1),
+            (3, 0xFFFF, 2),
+            (4, 0x0018, 1),
+            (4, 0x0017, 1 + 1),
+            (4, 0xFFFF, 125),
+        ] {
+            assert_eq!(
+                board.read(function, address, quantity),
+                Err(2),
+                "{address:#x}"
+            );
+        }
+        assert_eq!(board.write_one(0x0001, 0), Err(2));
+        assert_eq!(
+            board.write_many(0x0000, &[Command::Save.register(), 0]),
+            Err(2)
+        );
+        assert_eq!(board.write_many(0xFFFF, &[0, 0]), Err(2));
+        // Of two faults the address is named first.
+        assert_eq!(board.write_many(CAPACITY - 1, &[0, 0]), Err(2));
+    }
+
+    #[test]
+    fn requests_of_the_wrong_shape_are_illegal_values() {
+        let mut board = Board::new();
+        for pdu in [
+            &[0x03][..],
+            &[0x03, 0, 0, 0],
+            &[0x03, 0, 0, 0, 1, 0],
+            &[0x03, 0, 0, 0, 0],
+            &[0x03, 0, 0, 0, 126],
+            &[0x03, 0, 0, 1, 1],
+            &[0x04, 0, 0, 0, 0],
+            &[0x04, 0, 0, 0, 126],
+            &[0x04, 0, 0],
+            &[0x06, 9, 0, 0],
+            &[0x06, 9, 0, 0, 1, 0],
+            &[0x10],
+            &[0x10, 9, 0, 0, 1],
+            &[0x10, 9, 0, 0, 0, 0],
+            &[0x10, 9, 0, 0, 1, 2],
+            &[0x10, 9, 0, 0, 1, 2, 0],
+            &[0x10, 9, 0, 0, 1, 2, 0, 1, 0],
+            &[0x10, 9, 0, 0, 1, 3, 0, 1, 0],
+            &[0x10, 9, 0, 0, 2, 2, 0, 1],
+            &[0x10, 9, 0, 0, 1, 4, 0, 1, 0, 1],
+        ] {
+            let (reply, outcome) = board.ask(pdu);
+            assert_eq!(reply, [pdu[0] | 0x80, 3], "{pdu:x?}");
+            assert_eq!(outcome.exception, Some(Exception::IllegalDataValue));
+        }
+        let mut long = std::vec![0x10, 9, 0, 0, 124, 248];
+        long.extend([0; 248]);
+        assert_eq!(board.ask(&long).0, [0x90, 3]);
+        // 123 is allowed, there is only no such block: the address is at fault.
+        let mut longest = std::vec![0x10, 9, 0, 0, 123, 246];
+        longest.extend([0; 246]);
+        assert_eq!(board.ask(&longest).0, [0x90, 2]);
+        assert_eq!(board.read(4, 0, 125), Err(2));
+        assert_eq!(*board.store.active(), Configuration::default());
+    }
+
+    #[test]
+    fn other_functions_are_illegal() {
+        let mut board = Board::new();
+        for function in (0..=255u8).filter(|f| ![3, 4, 6, 16].contains(f)) {
+            let (reply, outcome) = board.ask(&[function, 0, 0, 0, 1]);
+            assert_eq!(reply, [function | 0x80, 1]);
+            assert_eq!(outcome.exception, Some(Exception::IllegalFunction));
+        }
+        assert_eq!(board.ask(&[]).0, [0x80, 1]);
+    }
+
+    #[test]
+    fn an_answer_that_does_not_fit_is_a_failure_and_not_a_part_of_an_answer() {
+        let mut board = Board::new();
+        let mut reply = Vec::<u8, 5>::new();
+        let outcome = handle(
+            &[4, 0, 0, 0, 2],
+            &board.readings,
+            &mut board.store,
+            &mut reply,
+        );
+        assert_eq!(outcome.exception, Some(Exception::ServerDeviceFailure));
+        assert_eq!(reply[..], [0x84, 4]);
+    }
+
+    #[test]
+    fn what_changes_the_measurement_waits_for_standstill() {
+        let mut board = Board::new();
+        let frozen = |board: &mut Board, exception: u8| {
+            for field in FIELDS {
+                let words = usize::from(field.layout.kind.width());
+                let answer = board.write_many(field.layout.address, &[0u16, 0, 0, 0][..words]);
+                match field.when {
+                    When::Standstill => assert_eq!(answer, Err(exception), "{field:?}"),
+                    When::Always => assert!(answer == Err(3) || answer == changed(), "{field:?}"),
+                }
+            }
+        };
+        board.readings.high_voltage_on = true;
+        frozen(&mut board, 4);
+        board.readings.activity = Activity::ZeroDrift;
+        frozen(&mut board, 4);
+        board.readings.high_voltage_on = false;
+        for activity in [
+            Activity::ZeroDrift,
+            Activity::KeyCalibration,
+            Activity::SupplyCalibration,
+        ] {
+            board.readings.activity = activity;
+            frozen(&mut board, 6);
+        }
+        board.readings.activity = Activity::None;
+        board.readings.high_voltage_permit = true;
+        frozen(&mut board, 4);
+        assert_eq!(board.write_one(FRONT_END, 1), Err(4));
+        assert_eq!(board.write_one(ADDRESS, 3), changed());
+        board.readings.high_voltage_permit = false;
+        assert_eq!(board.write_one(FRONT_END, 1), changed());
+    }
+
+    #[test]
+    fn a_corrupted_configuration_takes_no_change() {
+        let mut board = Board::new();
+        board.store.corrupt();
+        assert_eq!(board.write_one(ADDRESS, 3), Err(4));
+        assert!(board.store.verify().is_err());
+        assert_eq!(board.write_one(ADDRESS, 3), changed());
+    }
+
+    #[test]
+    fn commands_need_their_key() {
+        let mut board = Board::new();
+        board.readings.last_command = 0x5A03;
+        assert_eq!(board.read(3, COMMAND_ADDRESS, 1), Ok([0x5A03].to_vec()));
+        let mut numbers = BTreeSet::new();
+        for (index, (command, name, _)) in Command::ALL.into_iter().enumerate() {
+            let value = 0x5A01 + index as u16;
+            assert_eq!(command.register(), value, "{name}");
+            assert_eq!(Command::from_register(value), Some(command));
+            assert!(numbers.insert(value));
+        }
+        for value in 0..=u16::MAX {
+            if !numbers.contains(&value) {
+                assert_eq!(Command::from_register(value), None);
+            }
+        }
+        for value in [0, 1, 7, 0x5A00, 0x5A0C, 0xA507, 0x5B07] {
+            assert_eq!(board.write_one(COMMAND_ADDRESS, value), Err(3));
+        }
+        let save = Ok(Some(Event::Command(Command::Save)));
+        assert_eq!(board.write_one(COMMAND_ADDRESS, 0x5A07), save);
+        assert_eq!(board.write_many(COMMAND_ADDRESS, &[0x5A07]), save);
+        assert_eq!(board.store.generation(), 0);
+    }
+
+    #[test]
+    fn commands_need_their_state() {
+        use Activity as A;
+        use Command as C;
+        // (high voltage, activity, flash busy) and the answer to each command, 0 for accepted.
+        let quiet = (false, A::None, false);
+        let cases = [
+            (C::ZeroNow, quiet, 0),
+            (C::ZeroNow, (true, A::None, false), 4),
+            (C::ZeroNow, (false, A::ZeroDrift, false), 6),
+            (C::ZeroNow, (false, A::SupplyCalibration, false), 6),
+            (C::ZeroNow, (false, A::None, true), 0),
+            (C::StartKeyCalibration, quiet, 0),
+            (C::StartKeyCalibration, (true, A::None, false), 4),
+            (C::StartKeyCalibration, (false, A::KeyCalibration, false), 6),
+            (C::SupplyPointAtZero, quiet, 0),
+            (C::SupplyPointAtZero, (true, A::None, false), 4),
+            (
+                C::SupplyPointAtZero,
+                (false, A::SupplyCalibration, false),
+                0,
+            ),
+            (C::SupplyPointAtZero, (false, A::ZeroDrift, false), 6),
+            (C::SupplyPointAtZero, (false, A::KeyCalibration, false), 6),
+            (
+                C::SupplyPointAtCurrent,
+                (true, A::SupplyCalibration, false),
+                4,
+            ),
+            (
+                C::SupplyPointAtCurrent,
+                (false, A::SupplyCalibration, false),
+                0,
+            ),
+            (
+                C::SupplyPointAtCurrent,
+                (false, A::KeyCalibration, false),
+                6,
+            ),
+            (C::FinishSupplyCalibration, quiet, 4),
+            (
+                C::FinishSupplyCalibration,
+                (false, A::SupplyCalibration, false),
+                0,
+            ),
+            (
+                C::FinishSupplyCalibration,
+                (true, A::SupplyCalibration, false),
+                4,
+            ),
+            (C::FinishSupplyCalibration, (false, A::ZeroDrift, false), 6),
+            (
+                C::FinishSupplyCalibration,
+                (false, A::KeyCalibration, false),
+                6,
+            ),
+            (C::Abort, quiet, 0),
+            (C::Abort, (true, A::KeyCalibration, true), 0),
+            (C::Save, (true, A::None, false), 0),
+            (C::Save, (false, A::ZeroDrift, false), 0),
+            (C::Save, (false, A::None, true), 6),
+            (C::Restore, quiet, 0),
+            (C::Restore, (true, A::None, false), 4),
+            (C::Restore, (false, A::KeyCalibration, false), 6),
+            (C::FactoryDefaults, quiet, 0),
+            (C::FactoryDefaults, (true, A::None, false), 4),
+            (C::FactoryDefaults, (false, A::SupplyCalibration, false), 6),
+            (C::ClearLog, quiet, 0),
+            (C::ClearLog, (true, A::None, false), 4),
+            (C::ClearLog, (true, A::None, true), 4),
+            (C::ClearLog, (false, A::ZeroDrift, true), 6),
+            (C::ClearLog, (false, A::ZeroDrift, false), 0),
+            (C::ClearDiagnoses, (true, A::KeyCalibration, true), 0),
+        ];
+        for (command, (high_voltage, activity, busy), answer) in cases {
+            for permit in [false, true] {
+                let mut board = Board::new();
+                board.readings.high_voltage_on = high_voltage && !permit;
+                board.readings.high_voltage_permit = high_voltage && permit;
+                board.readings.activity = activity;
+                board.readings.storage_busy = busy;
+                let expected = match answer {
+                    0 => Ok(Some(Event::Command(command))),
+                    code => Err(code),
+                };
+                assert_eq!(
+                    board.write_one(COMMAND_ADDRESS, command.register()),
+                    expected,
+                    "{command:?} {activity:?} {high_voltage} {busy}"
+                );
+            }
+        }
+        assert_eq!(
+            board_text(C::ZeroNow),
+            "high voltage off, no calibration under way"
+        );
+        assert_eq!(
+            board_text(C::SupplyPointAtZero),
+            "high voltage off, no other calibration under way"
+        );
+        assert_eq!(
+            board_text(C::FinishSupplyCalibration),
+            "high voltage off, supply calibration under way"
+        );
+        assert_eq!(board_text(C::Save), "flash not busy");
+        assert_eq!(board_text(C::ClearLog), "high voltage off, flash not busy");
+        assert_eq!(board_text(C::Abort), "always");
+    }
+
+    fn board_text(command: Command) -> &'static str {
+        command.when().text()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(400))]
+
+        #[test]
+        fn no_request_panics_and_only_an_event_changes_anything(
+            function in prop_oneof![Just(3u8), Just(4), Just(6), Just(16), any::<u8>()],
+            data in prop::collection::vec(any::<u8>(), 0..255),
+        ) {
+            let mut board = Board::new();
+            let mut pdu = std::vec![function];
+            pdu.extend(data);
+            let before = *board.store.active();
+            let (reply, outcome) = board.ask(&pdu);
+            prop_assert!(reply[0] & 0x7F == function & 0x7F);
+            prop_assert_eq!(outcome.exception.is_some(), reply[0] == function | 0x80);
+            if outcome.event != Some(Event::ConfigurationChanged) {
+                prop_assert_eq!(*board.store.active(), before);
+            }
+        }
+
+        #[test]
+        fn what_was_written_is_read_back_or_nothing_has_changed(
+            row: prop::sample::Index,
+            skip in 0..4u16,
+            words in prop::collection::vec(prop_oneof![0..200u16, any::<u16>()], 1..8),
+        ) {
+            let mut board = Board::new();
+            let address = FIELDS[row.index(FIELDS.len())].layout.address + skip;
+            let before = *board.store.active();
+            let answer = board.write_many(address, &words);
+            if answer == changed() {
+                prop_assert_eq!(board.read(3, address, words.len() as u16), Ok(words));
+                prop_assert_eq!(board.store.active().validate(), Ok(()));
+                prop_assert_eq!(board.store.generation(), 1);
+            } else {
+                prop_assert!(matches!(answer, Err(2 | 3)));
+                prop_assert_eq!((*board.store.active(), board.store.generation()), (before, 0));
+            }
+        }
+    }
+}
