@@ -1,0 +1,1276 @@
+//! The composition: what the board's owners hand in, and what goes out on CAN, RS485 and into the log.
+//!
+//! ```text
+//! on_conversion, on_converter_fault ┐
+//! on_meter                          ├─→ Measurement ─→ current(), charge(), … frames of `can`
+//! on_environment, on_cell_voltage   │               ├─→ fill(Readings) for `modbus`
+//! tick (10 ms)                      ┘               └─→ retained(), log_record()
+//! ```
+//!
+//! It belongs to one owner (the firmware's priority-2 task) and never blocks. The configuration is not part of it: the
+//! caller hands in the active one, and tells by [`Measurement::configuration_changed`] when it is another one.
+//!
+//! **The meter hangs on the same sensor.** What is known about the sensor (zero drift, key-state factors, supply) holds
+//! for the charge as well as for the current: [`effective_meter_config`] works it into the meter's scale and offset.
+
+use crate::can;
+use crate::channel_compare::{ChannelCompare, CompareReport, Conversion, Outcome};
+use crate::configuration::Configuration;
+use crate::converter::{
+    Adc1Sample, Converter, ConverterCoefficients, ConverterSample, Corrections, CurrentReading,
+    SampleContext, SupplyMode,
+};
+use crate::design_parameters as design;
+use crate::diagnosis::{Changes, Code, CodeSet, Diagnosis, Effects};
+use crate::front_end::{Channel, FrontEnd, KeyFactors, PerRange, SupplyRelations};
+use crate::key_calibration::{
+    KeyCalibration, KeyInputs, KeyOutputs, KeyPhase, KeySample, KeyState,
+};
+use crate::meter::{GapBridge, MeterConfig, MeterReport};
+use crate::modbus::readings::CommandState;
+use crate::modbus::{Activity, Readings};
+use crate::open_sensor::{Finding, OpenSensor, OpenSensorThresholds};
+use crate::range::{
+    ChatterDetector, ChatterReport, FlagObservation, FlagPlausibility, FlagReport, Range,
+    RangeHistory,
+};
+use crate::retained::{LogRecord, RetainedState};
+use crate::sliding_average::{Average, SlidingAverage};
+use crate::soc::{CellVoltage, Soc, SocCoefficients, SocInput, SocReading};
+use crate::supply_calibration::{Run, SupplyCalibration, SupplyPoint};
+use crate::units::{
+    Duration, Instant, Microamps, Microvolts, MilliCelsius, Millivolts, Nanocoulombs, Ppm,
+    clamp_i32, div_round, elapsed, mul_div,
+};
+use crate::validity::Validity;
+use crate::zero_drift::{ZeroCalibration, ZeroConditions, ZeroRefusal};
+
+/// What ADC1 and the temperature sensors say; `None` for what could not be read.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Environment {
+    /// Supply of the Hall sensors.
+    pub supply: Option<Microvolts>,
+    /// Voltage at the open-sensor channel's pin.
+    pub network: Option<Microvolts>,
+    /// Temperature by the meter's own sensor, next to the Hall sensors.
+    pub sensor_temperature: Option<MilliCelsius>,
+    /// Temperature of the microcontroller.
+    pub board_temperature: Option<MilliCelsius>,
+    /// Supply of the microcontroller.
+    pub controller_supply: Option<Millivolts>,
+}
+
+/// Lines of the vehicle, and what the vehicle says on CAN while it is fresh.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Vehicle {
+    /// Key line: high from ACC on.
+    pub acc_line: bool,
+    /// High-voltage feedback line.
+    pub hv_feedback: bool,
+    /// Key state received.
+    pub can_key: Option<KeyState>,
+    /// High-voltage state received.
+    pub can_high_voltage: Option<bool>,
+    /// Whether `VehicleState` is fresh.
+    pub state_fresh: bool,
+    /// Whether `BatteryVoltage` is fresh.
+    pub voltage_fresh: bool,
+}
+
+/// How a read of the ADS1100 failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum ConverterFault {
+    /// It did not answer.
+    NoAnswer,
+    /// It lost its configuration.
+    ConfigurationLost,
+}
+
+/// A setting that a calibration has found; the owner of the configuration stores it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Found {
+    /// Zero drift of a sensor (D2).
+    ZeroDrift(Range, Microamps),
+    /// Factors by key state (D4).
+    KeyFactors(KeyFactors),
+    /// Supply relations (D4).
+    SupplyRelations(SupplyRelations),
+}
+
+impl Found {
+    /// Writes it into `configuration`.
+    pub fn store(self, configuration: &mut Configuration) {
+        match self {
+            Self::ZeroDrift(range, value) => configuration.zero_drift.value.set(range, value),
+            Self::KeyFactors(factors) => configuration.key_factors = factors,
+            Self::SupplyRelations(relations) => {
+                if let FrontEnd::ClosedLoop(sensor) = &mut configuration.front_end {
+                    sensor.relations = relations;
+                }
+            }
+        }
+    }
+}
+
+/// An order to the calibrations, its state already checked by `modbus`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum Order {
+    /// Take the present reading of the selected sensor as its zero.
+    ZeroNow,
+    /// Begin the key-state calibration anew.
+    KeyCalibration,
+    /// Add a point at 0 A to the supply sweep.
+    SupplyPointAtZero,
+    /// Add a point at the test current.
+    SupplyPointAtCurrent,
+    /// Work out the supply relations.
+    FinishSupplyCalibration,
+    /// End what is under way.
+    Abort,
+    /// Clear latched diagnoses whose cause has gone.
+    ClearDiagnoses,
+}
+
+/// Why an order was not carried out; its number is the `command reason` on Modbus.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[repr(u16)]
+pub enum Refusal {
+    /// A calibration is under way already.
+    Busy = 1,
+    /// High voltage is on or may come on.
+    HighVoltage = 2,
+    /// The meter sees a current.
+    CurrentFlows = 3,
+    /// The meter has no valid mean.
+    MeterUnknown = 4,
+    /// A reading is not valid.
+    InvalidReading = 5,
+    /// The readings spread too far.
+    Unstable = 6,
+    /// The result is beyond its limit.
+    BeyondLimit = 7,
+    /// Too few readings in time.
+    Timeout = 8,
+    /// Ended by command.
+    Cancelled = 9,
+    /// The front end in use has no such calibration.
+    NotForThisFrontEnd = 10,
+    /// The configuration switches it off.
+    Disabled = 11,
+    /// The sensor's supply is not known or outside its limits.
+    SupplyUnknown = 12,
+    /// The supply calibration refused the point or the result.
+    SupplyCalibration = 13,
+}
+
+impl From<ZeroRefusal> for Refusal {
+    fn from(refusal: ZeroRefusal) -> Self {
+        match refusal {
+            ZeroRefusal::Busy => Self::Busy,
+            ZeroRefusal::HighVoltage => Self::HighVoltage,
+            ZeroRefusal::CurrentFlows { .. } => Self::CurrentFlows,
+            ZeroRefusal::MeterUnknown => Self::MeterUnknown,
+            ZeroRefusal::InvalidReading => Self::InvalidReading,
+            ZeroRefusal::Unstable { .. } => Self::Unstable,
+            ZeroRefusal::BeyondLimit { .. } => Self::BeyondLimit,
+            ZeroRefusal::Timeout => Self::Timeout,
+            ZeroRefusal::Cancelled => Self::Cancelled,
+        }
+    }
+}
+
+/// What a tick results in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Tick {
+    /// Whether the high voltage may be on: the permit output.
+    pub hv_permit: bool,
+    /// Diagnoses that came and went.
+    pub changes: Changes,
+    /// A setting to be stored.
+    pub found: Option<Found>,
+}
+
+/// How many ticks the supply is averaged over: one conversion of ADC1 is 1.6 mV of a 5 V supply.
+const SUPPLY_SHIFT: u32 = 4;
+/// Environment readings older than this are missing.
+const ENVIRONMENT_TIMEOUT: Duration = Duration::from_ticks(500_000);
+/// Above this the state of charge is reported as uncertain: a tenth of the capacity.
+pub const SOC_UNCERTAINTY_LIMIT: Ppm = Ppm(100_000);
+
+#[derive(Clone, Copy, Debug)]
+struct Prepared {
+    converter: ConverterCoefficients,
+    open_sensor: OpenSensorThresholds,
+    soc: SocCoefficients,
+    /// The supply that went into it.
+    supply: Option<Microvolts>,
+}
+
+/// The composition's state.
+#[derive(Clone, Copy, Debug)]
+pub struct Measurement {
+    prepared: Prepared,
+    converter: Converter,
+    converter_fault: Option<ConverterFault>,
+    conversions: u32,
+    invalid_conversions: u32,
+    refused_steps: u32,
+    reading: CurrentReading,
+    average: SlidingAverage,
+    open_sensor: OpenSensor,
+    flag: FlagReport,
+    flag_plausibility: FlagPlausibility,
+    chatter_detector: ChatterDetector,
+    chatter: ChatterReport,
+    compare: ChannelCompare,
+    meter: MeterReport,
+    meter_causes: Validity,
+    zero: ZeroCalibration,
+    zero_beyond_limit: bool,
+    sweep: Option<SupplyCalibration>,
+    key: KeyCalibration,
+    key_outputs: KeyOutputs,
+    soc: Soc,
+    soc_reading: SocReading,
+    environment: Environment,
+    environment_at: Option<Instant>,
+    supply_sum: Option<i64>,
+    cell_voltage: Option<CellVoltage>,
+    pack_voltage: Option<Millivolts>,
+    vehicle: Vehicle,
+    history: RangeHistory,
+    diagnosis: Diagnosis,
+    effects: Effects,
+    found: Option<Found>,
+    order_outcome: (CommandState, u16),
+    restored_with_loss: bool,
+    now: Instant,
+}
+
+/// The meter's configuration with everything that is known about the sensor in front of it: zero drift, key-state
+/// factors and supply.
+///
+/// With `I = (k·(V + a) − V0)·G − zero` the meter, which sees `(V − V0)·G`, reads the true current divided by k, and
+/// at 0 A it reads what a sensor output of `(V0 + zero/G)/k − a` gives.
+///
+/// The level shift in front of channel 1 is half the sensor's supply, so a ratiometric sensor's zero cancels and its
+/// sensitivity follows the supply: the correction is 5 V / Vc.
+#[must_use]
+pub fn effective_meter_config(
+    configuration: &Configuration,
+    factors: KeyFactors,
+    supply: Option<Microvolts>,
+) -> MeterConfig {
+    let mut meter = configuration.meter;
+    let nominal = design::SENSOR_NOMINAL_SUPPLY;
+    let supply = supply
+        .filter(|_| configuration.converter.supply_mode != SupplyMode::Fixed)
+        .unwrap_or(nominal)
+        .clamp(design::SENSOR_SUPPLY_LOW, design::SENSOR_SUPPLY_HIGH);
+    let one = i64::from(Ppm::ONE.get());
+    for range in [Range::Small, Range::Large] {
+        let line = configuration.front_end.line(range, supply);
+        // Share by which the reading has to be multiplied.
+        let (supply_factor, shift_error) = match configuration.front_end {
+            FrontEnd::DualRange(_) | FrontEnd::Hah1bv(_) => (
+                mul_div(one, i64::from(nominal.get()), i64::from(supply.get())),
+                0,
+            ),
+            FrontEnd::ClosedLoop(_) => {
+                let rated = configuration.front_end.line(range, nominal);
+                let factor = mul_div(
+                    mul_div(one, line.numerator, line.denominator),
+                    rated.denominator,
+                    rated.numerator,
+                );
+                // nV between the sensor's zero and the level shift of Vc/2.
+                (factor, line.zero_nanovolts - i64::from(supply.get()) * 500)
+            }
+            // Its sensor runs from ±15 V and its level shift is the network's reference.
+            FrontEnd::Network(_) => (one, 0),
+        };
+        let factors = if range == KeyCalibration::RANGE || !configuration.front_end.has_two_ranges()
+        {
+            factors
+        } else {
+            KeyFactors::NONE
+        };
+        let k_ppm = div_round(i64::from(factors.k_ppb), 1_000);
+        let zero_at_input = i64::from(
+            line.voltage(configuration.zero_drift.value.get(range))
+                .get(),
+        );
+        let input_at_zero = mul_div(
+            zero_at_input,
+            i64::from(KeyFactors::K_ONE_PPB),
+            i64::from(factors.k_ppb),
+        )
+        .saturating_sub(i64::from(factors.a.get()));
+        let sensor_zero_at_zero = line.current(Microvolts(clamp_i32(input_at_zero))).get();
+        let shift = mul_div(shift_error, line.numerator, line.denominator);
+        let offset = i64::from(sensor_zero_at_zero).saturating_add(shift);
+        let gain = mul_div(
+            mul_div(
+                one + i64::from(meter.gain.get(range).get()),
+                supply_factor,
+                one,
+            ),
+            k_ppm,
+            one,
+        ) - one;
+        meter.gain.set(range, Ppm(clamp_i32(gain)));
+        // The offset is subtracted after the gain.
+        let offset = mul_div(offset, k_ppm, one);
+        let own = meter.offset.get(range);
+        meter
+            .offset
+            .set(range, own.saturating_add(Microamps(clamp_i32(offset))));
+    }
+    meter
+}
+
+fn prepare(
+    configuration: &Configuration,
+    factors: KeyFactors,
+    supply: Option<Microvolts>,
+) -> Prepared {
+    let two_ranges = configuration.front_end.has_two_ranges();
+    let corrections = Corrections {
+        key_factors: PerRange {
+            small: factors,
+            large: if two_ranges { KeyFactors::NONE } else { factors },
+        },
+        gain: configuration.current_gain,
+        zero_drift: configuration.zero_drift.value,
+    };
+    Prepared {
+        converter: ConverterCoefficients::prepare(
+            &configuration.converter,
+            &configuration.front_end,
+            &corrections,
+            supply,
+        ),
+        open_sensor: OpenSensorThresholds::prepare(
+            &configuration.open_sensor,
+            &configuration.front_end,
+            supply,
+        ),
+        soc: SocCoefficients::new(&configuration.soc),
+        supply,
+    }
+}
+
+impl Measurement {
+    /// Starts, going on from `retained` where there is such a state. `loss` is the charge that the reset may have cost;
+    /// zero after a clean restart.
+    #[must_use]
+    pub fn new(
+        configuration: &Configuration,
+        retained: Option<&RetainedState>,
+        loss: Nanocoulombs,
+        now: Instant,
+    ) -> Self {
+        let factors = retained.map_or(configuration.key_factors, |state| state.key_factors);
+        let prepared = prepare(configuration, factors, None);
+        let mut soc = retained.map_or_else(
+            || Soc::new(&prepared.soc),
+            |state| Soc::restore(&prepared.soc, &state.soc, state.charge_total),
+        );
+        let restored_with_loss = loss != Nanocoulombs::ZERO;
+        if restored_with_loss {
+            soc.declare_loss(&prepared.soc, loss);
+        }
+        let mut measurement = Self {
+            prepared,
+            converter: Converter::new(),
+            converter_fault: None,
+            conversions: 0,
+            invalid_conversions: 0,
+            refused_steps: 0,
+            reading: Converter::new().reading(&prepared.converter, now),
+            average: SlidingAverage::new(),
+            open_sensor: OpenSensor::new(),
+            flag: FlagReport::default(),
+            flag_plausibility: FlagPlausibility::new(),
+            chatter_detector: ChatterDetector::new(),
+            chatter: ChatterReport::default(),
+            compare: ChannelCompare::new(),
+            meter: MeterReport::default(),
+            meter_causes: Validity::STALE,
+            zero: ZeroCalibration::new(),
+            zero_beyond_limit: false,
+            sweep: None,
+            key: KeyCalibration::new(factors, now),
+            key_outputs: KeyOutputs {
+                hv_permit: false,
+                key: KeyState::Off,
+                phase: KeyPhase::Off,
+                new_factors: None,
+                hv_without_permit: false,
+                key_contradiction: false,
+                refusal: None,
+            },
+            soc_reading: soc.reading(&prepared.soc),
+            soc,
+            environment: Environment::default(),
+            environment_at: None,
+            supply_sum: None,
+            cell_voltage: None,
+            pack_voltage: None,
+            vehicle: Vehicle::default(),
+            history: RangeHistory::steady(now, Range::Small),
+            diagnosis: Diagnosis::default(),
+            effects: Effects::default(),
+            found: None,
+            order_outcome: (CommandState::None, 0),
+            restored_with_loss,
+            now,
+        };
+        if let Some(state) = retained {
+            measurement.meter.charge_total = state.charge_total;
+        }
+        measurement
+    }
+
+    /// The active configuration is another one: factors are worked out anew, nothing measured is lost. The meter's
+    /// owner has to be handed [`Measurement::meter_config`] as well.
+    pub fn configuration_changed(&mut self, configuration: &Configuration) {
+        let before = self.prepared.soc;
+        self.prepared = prepare(configuration, self.key.factors(), self.prepared.supply);
+        if before.capacity() != self.prepared.soc.capacity() {
+            self.soc.change_capacity(&before, &self.prepared.soc);
+        }
+        self.soc_reading = self.soc.reading(&self.prepared.soc);
+    }
+
+    /// What the meter's owner has to count with.
+    #[must_use]
+    pub fn meter_config(&self, configuration: &Configuration) -> MeterConfig {
+        effective_meter_config(configuration, self.key.factors(), self.prepared.supply)
+    }
+
+    /// A finished conversion of the ADS1100, with the range history of the moment at which it was read.
+    pub fn on_conversion(
+        &mut self,
+        configuration: &Configuration,
+        sample: &ConverterSample,
+        history: &RangeHistory,
+    ) {
+        let context = self.context(configuration, history, sample.started);
+        let reading = self.converter.on_sample(
+            &configuration.converter,
+            &self.prepared.converter,
+            sample,
+            &context,
+        );
+        let lost = sample.configuration != configuration.converter.expected_configuration();
+        self.converter_fault = lost.then_some(ConverterFault::ConfigurationLost);
+        if let Some(reading) = reading {
+            self.on_reading(configuration, reading, sample.started, history);
+        }
+        self.judge_flag(configuration, i32::from(sample.code), history);
+    }
+
+    /// The ADS1100 delivered nothing.
+    pub fn on_converter_fault(&mut self, fault: ConverterFault, at: Instant) {
+        if self.prepared.converter.channel() == Channel::Ads1100 {
+            self.converter_fault = Some(fault);
+            self.reading = self.converter.on_fault(at);
+        }
+    }
+
+    /// What ADC1 and the temperature sensors say. For a front end on ADC1 (D3) the network's voltage is the conversion.
+    pub fn on_environment(
+        &mut self,
+        configuration: &Configuration,
+        environment: Environment,
+        history: &RangeHistory,
+        now: Instant,
+    ) {
+        self.environment = environment;
+        self.environment_at = Some(now);
+        self.average_supply(configuration, environment.supply);
+        let Some(network) = environment.network else {
+            return;
+        };
+        self.open_sensor.on_network(
+            &configuration.open_sensor,
+            &self.prepared.open_sensor,
+            network,
+            now,
+        );
+        if self.prepared.converter.channel() == Channel::Adc1 {
+            let sample = Adc1Sample {
+                started: now,
+                finished: now,
+                volts: network,
+            };
+            let context = self.context(configuration, history, now);
+            if let Some(reading) = self.converter.on_adc1_sample(
+                &configuration.converter,
+                &self.prepared.converter,
+                &sample,
+                &context,
+            ) {
+                self.on_reading(configuration, reading, now, history);
+            }
+        }
+    }
+
+    /// What the meter has counted, and the causes against it that its owner knows (chip fault, self-test).
+    pub fn on_meter(&mut self, configuration: &Configuration, report: &MeterReport, causes: Validity) {
+        self.meter = *report;
+        self.meter_causes = causes
+            .and_if(report.at.is_none(), Validity::STALE)
+            .and_if(report.lost, Validity::CHIP_FAULT);
+        self.compare.on_meter(&configuration.compare, report);
+        let now = report.at.unwrap_or(self.now);
+        self.soc.update(
+            &self.prepared.soc,
+            &configuration.ocv,
+            &SocInput {
+                now,
+                charge_total: report.charge_total,
+                current: self.reading.validity.is_valid().then_some(self.reading.current),
+                cell_voltage: self.cell_voltage,
+            },
+        );
+        self.soc_reading = self.soc.reading(&self.prepared.soc);
+    }
+
+    /// A battery voltage received over CAN.
+    pub fn on_battery_voltage(&mut self, voltage: &can::BatteryVoltage, at: Instant) {
+        self.cell_voltage = voltage
+            .cell
+            .map(|voltage| CellVoltage { voltage, at });
+        self.pack_voltage = voltage.pack;
+    }
+
+    /// Sets the state of charge by order of a host.
+    pub fn set_state_of_charge(&mut self, soc: Ppm, uncertainty: Ppm) {
+        self.soc.set(&self.prepared.soc, soc, uncertainty);
+        self.soc_reading = self.soc.reading(&self.prepared.soc);
+    }
+
+    /// The part that runs by the clock, every 10 ms: key state and permit, calibrations, time-outs, diagnosis.
+    /// `external` are the conditions that only the owners of the hardware know.
+    pub fn tick(
+        &mut self,
+        configuration: &Configuration,
+        now: Instant,
+        vehicle: &Vehicle,
+        history: &RangeHistory,
+        external: CodeSet,
+    ) -> Tick {
+        self.now = now;
+        self.vehicle = *vehicle;
+        self.history = *history;
+        self.reading = self.converter.reading(&self.prepared.converter, now);
+        self.chatter = self.chatter_detector.step(&configuration.chatter, history);
+        let measured = self.reading.validity.without(Validity::SATURATED).is_valid();
+        self.key_outputs = self.key.step(
+            &configuration.key_calibration,
+            &KeyInputs {
+                now,
+                acc_line: vehicle.acc_line,
+                hv_feedback: vehicle.hv_feedback,
+                can_key: vehicle.can_key,
+                can_high_voltage: vehicle.can_high_voltage,
+                meter_current: self.meter_mean(),
+                sample: (self.conversions > 0).then_some(KeySample {
+                    voltage: measured.then_some(self.reading.volts),
+                    range: self.reading.range,
+                    at: self.reading.at,
+                }),
+            },
+        );
+        if let Some(factors) = self.key_outputs.new_factors {
+            self.prepared = prepare(configuration, factors, self.prepared.supply);
+            self.found = Some(Found::KeyFactors(factors));
+        }
+        if let Some(refusal) = self.zero.tick(&configuration.zero_drift, now) {
+            self.fail(refusal.into());
+        }
+        let conditions = self.conditions(configuration).union(external);
+        let changes = self.diagnosis.step(now, conditions);
+        self.effects = self.diagnosis.effects();
+        self.refused_steps = self.converter.counters().steps_refused;
+        Tick {
+            hv_permit: self.key_outputs.hv_permit,
+            changes,
+            found: self.found.take(),
+        }
+    }
+
+    /// Carries out an order of a client. What takes time ends in `command state` and `command reason`.
+    ///
+    /// # Errors
+    /// Why it was not even begun.
+    pub fn order(&mut self, configuration: &Configuration, order: Order) -> Result<(), Refusal> {
+        let result = self.begin(configuration, order);
+        match result {
+            Ok(state) => self.order_outcome = (state, 0),
+            Err(refusal) => self.fail(refusal),
+        }
+        result.map(|_| ())
+    }
+
+    /// Notes the outcome of a command that others carry out (save, restore, clear log).
+    pub fn note_command(&mut self, state: CommandState, reason: u16) {
+        self.order_outcome = (state, reason);
+    }
+
+    fn begin(
+        &mut self,
+        configuration: &Configuration,
+        order: Order,
+    ) -> Result<CommandState, Refusal> {
+        match order {
+            Order::ZeroNow => {
+                if self.sweep.is_some() {
+                    return Err(Refusal::Busy);
+                }
+                let conditions = self.zero_conditions();
+                self.zero.start(
+                    &configuration.zero_drift,
+                    self.history.range,
+                    &conditions,
+                    self.now,
+                )?;
+                self.zero_beyond_limit = false;
+                Ok(CommandState::Running)
+            }
+            Order::KeyCalibration => {
+                if !configuration.key_calibration.enabled {
+                    return Err(Refusal::Disabled);
+                }
+                if !self.high_voltage_is_off() || self.key_outputs.hv_permit {
+                    return Err(Refusal::HighVoltage);
+                }
+                self.key = KeyCalibration::new(self.key.factors(), self.now);
+                Ok(CommandState::Running)
+            }
+            Order::SupplyPointAtZero => self.supply_point(configuration, Run::Zero),
+            Order::SupplyPointAtCurrent => {
+                self.supply_point(configuration, Run::Loaded(configuration.supply_test_current))
+            }
+            Order::FinishSupplyCalibration => {
+                let FrontEnd::ClosedLoop(sensor) = configuration.front_end else {
+                    return Err(Refusal::NotForThisFrontEnd);
+                };
+                let sweep = self.sweep.ok_or(Refusal::SupplyCalibration)?;
+                let calibrated = sweep
+                    .finish(
+                        &configuration.supply_calibration,
+                        i32::try_from(sensor.turns).unwrap_or(i32::MAX),
+                    )
+                    .map_err(|_| Refusal::SupplyCalibration)?;
+                self.sweep = None;
+                self.found = Some(Found::SupplyRelations(calibrated.relations));
+                Ok(CommandState::Done)
+            }
+            Order::Abort => {
+                let ended = self.zero.cancel().is_some() | self.sweep.take().is_some();
+                Ok(if ended {
+                    CommandState::Failed
+                } else {
+                    CommandState::Done
+                })
+            }
+            Order::ClearDiagnoses => {
+                self.diagnosis.clear();
+                Ok(CommandState::Done)
+            }
+        }
+    }
+
+    fn supply_point(
+        &mut self,
+        configuration: &Configuration,
+        run: Run,
+    ) -> Result<CommandState, Refusal> {
+        if !matches!(configuration.front_end, FrontEnd::ClosedLoop(_)) {
+            return Err(Refusal::NotForThisFrontEnd);
+        }
+        if self.zero.is_running() {
+            return Err(Refusal::Busy);
+        }
+        let supply = self.prepared.supply.ok_or(Refusal::SupplyUnknown)?;
+        let usable = self
+            .reading
+            .validity
+            .without(Validity::CALIBRATING)
+            .is_valid();
+        if !usable {
+            return Err(Refusal::InvalidReading);
+        }
+        let mut sweep = self.sweep.unwrap_or_default();
+        sweep
+            .add(
+                &configuration.supply_calibration,
+                run,
+                SupplyPoint {
+                    supply,
+                    output: self.reading.volts,
+                },
+            )
+            .map_err(|_| Refusal::SupplyCalibration)?;
+        self.sweep = Some(sweep);
+        Ok(CommandState::Done)
+    }
+
+    fn fail(&mut self, refusal: Refusal) {
+        self.order_outcome = (CommandState::Failed, refusal as u16);
+    }
+
+    fn context(
+        &self,
+        configuration: &Configuration,
+        history: &RangeHistory,
+        started: Instant,
+    ) -> SampleContext {
+        let two_ranges = configuration.front_end.has_two_ranges();
+        SampleContext {
+            range: if two_ranges { history.range } else { Range::Small },
+            spoiled_by_edge: two_ranges
+                && history.conversion_spoiled(started, configuration.converter.settling()),
+            meter_mean: self.meter_mean(),
+        }
+    }
+
+    fn on_reading(
+        &mut self,
+        configuration: &Configuration,
+        reading: CurrentReading,
+        started: Instant,
+        history: &RangeHistory,
+    ) {
+        self.history = *history;
+        self.reading = reading;
+        self.conversions = self.conversions.wrapping_add(1);
+        if !reading.validity.is_valid() {
+            self.invalid_conversions = self.invalid_conversions.saturating_add(1);
+        }
+        self.open_sensor.on_converter(
+            &configuration.open_sensor,
+            &self.prepared.open_sensor,
+            &reading,
+        );
+        self.average.push(&configuration.average, &reading);
+        self.compare.on_conversion(
+            &configuration.compare,
+            &Conversion {
+                started,
+                finished: reading.at,
+                current: reading.current,
+                range: reading.range,
+                usable: reading.validity.is_valid(),
+            },
+        );
+        let conditions = self.zero_conditions();
+        match self
+            .zero
+            .on_reading(&configuration.zero_drift, &reading, &conditions)
+        {
+            Some(Ok(result)) => {
+                self.found = Some(Found::ZeroDrift(result.range, result.value));
+                self.order_outcome = (CommandState::Done, 0);
+            }
+            Some(Err(refusal)) => {
+                self.zero_beyond_limit = matches!(refusal, ZeroRefusal::BeyondLimit { .. });
+                self.fail(refusal.into());
+            }
+            None => {}
+        }
+    }
+
+    /// Flag against level, with the small sensor's own voltage beside it where the network taps it.
+    fn judge_flag(&mut self, configuration: &Configuration, code: i32, history: &RangeHistory) {
+        let unusable = Validity::RANGE_CHANGE
+            .and(Validity::CHIP_FAULT)
+            .and(Validity::STALE);
+        if !configuration.front_end.has_two_ranges()
+            || self.reading.validity.bits() & unusable.bits() != 0
+        {
+            return;
+        }
+        let own = self
+            .environment
+            .network
+            .filter(|_| !self.open_sensor.finding(Range::Small).is_fault())
+            .map(|volts| {
+                let hall = hall_voltage(volts);
+                let supply = self.prepared.supply.unwrap_or(design::SENSOR_NOMINAL_SUPPLY);
+                let rated = mul_div(
+                    i64::from(hall.get()),
+                    i64::from(design::SENSOR_NOMINAL_SUPPLY.get()),
+                    i64::from(supply.get()),
+                );
+                configuration.front_end.current(
+                    Microvolts(clamp_i32(rated)),
+                    Range::Small,
+                    design::SENSOR_NOMINAL_SUPPLY,
+                )
+            });
+        self.flag = self.flag_plausibility.step(
+            &configuration.flag,
+            &FlagObservation {
+                at: self.reading.at,
+                flag: history.range,
+                passed_as_small: self.prepared.converter.current(code, Range::Small),
+                passed_as_large: self.prepared.converter.current(code, Range::Large),
+                small_sensor: own,
+            },
+        );
+    }
+
+    /// A mean over some conversions of ADC1; a jump beyond half a volt is taken at once.
+    fn average_supply(&mut self, configuration: &Configuration, supply: Option<Microvolts>) {
+        let mean = supply.map(|supply| {
+            let now = i64::from(supply.get());
+            let sum = match self.supply_sum {
+                Some(sum) if ((sum >> SUPPLY_SHIFT) - now).abs() < 500_000 => {
+                    sum - (sum >> SUPPLY_SHIFT) + now
+                }
+                _ => now << SUPPLY_SHIFT,
+            };
+            self.supply_sum = Some(sum);
+            Microvolts(clamp_i32(sum >> SUPPLY_SHIFT))
+        });
+        if mean.is_none() {
+            self.supply_sum = None;
+        }
+        // Below a millivolt, 20 ppm of the supply, new factors would be worked out for noise.
+        let moved = match (mean, self.prepared.supply) {
+            (Some(new), Some(old)) => new.saturating_sub(old).saturating_abs().get() >= 1_000,
+            (new, old) => new.is_some() != old.is_some(),
+        };
+        if moved {
+            self.prepared = prepare(configuration, self.key.factors(), mean);
+        }
+    }
+
+    /// The meter's mean current while nothing speaks against it.
+    fn meter_mean(&self) -> Option<Microamps> {
+        (self.meter_causes.is_valid() && !self.meter.mean_over.is_zero())
+            .then_some(self.meter.mean_current)
+    }
+
+    fn high_voltage_is_off(&self) -> bool {
+        !self.vehicle.hv_feedback && self.vehicle.can_high_voltage != Some(true)
+    }
+
+    fn zero_conditions(&self) -> ZeroConditions {
+        ZeroConditions {
+            high_voltage_is_off: self.high_voltage_is_off() && !self.key_outputs.hv_permit,
+            meter_mean: self.meter_mean(),
+        }
+    }
+
+    fn environment_is_missing(&self) -> bool {
+        self.environment_at
+            .is_none_or(|at| elapsed(at, self.now) > ENVIRONMENT_TIMEOUT)
+    }
+
+    fn conditions(&self, configuration: &Configuration) -> CodeSet {
+        let two_ranges = configuration.front_end.has_two_ranges();
+        let selected = if two_ranges {
+            self.history.range
+        } else {
+            Range::Small
+        };
+        let finding = self.open_sensor.finding(selected);
+        let small = self.open_sensor.finding(Range::Small);
+        let supply_is_bad = self.environment_is_missing()
+            || self.environment.supply.is_none_or(|supply| {
+                !(design::SENSOR_SUPPLY_LOW..=design::SENSOR_SUPPLY_HIGH).contains(&supply)
+            });
+        let too_hot_or_cold = |temperature: Option<MilliCelsius>| {
+            temperature.is_some_and(|temperature| {
+                !(design::TEMPERATURE_LOW..=design::TEMPERATURE_HIGH).contains(&temperature)
+            })
+        };
+        let counters = self.converter.counters();
+        let implausible = self.reading.validity.contains(Validity::IMPLAUSIBLE);
+        let by_rate = implausible && counters.steps_refused != self.refused_steps;
+        let has_no_relations = matches!(
+            configuration.front_end,
+            FrontEnd::ClosedLoop(sensor) if sensor.relations == SupplyRelations::default()
+        );
+        let compared = self.compare.report();
+        let disagree = |outcome| matches!(outcome, Outcome::Disagree { .. });
+        let rows = [
+            (Code::OpenSensor, finding == Finding::Open),
+            (
+                Code::SensorRail,
+                finding.is_fault() && finding != Finding::Open,
+            ),
+            (
+                Code::SmallSensorOpen,
+                two_ranges && selected == Range::Large && small.is_fault(),
+            ),
+            (
+                Code::SensorSaturated,
+                self.reading.validity.contains(Validity::SATURATED),
+            ),
+            (
+                Code::ConverterNoAnswer,
+                self.converter_fault == Some(ConverterFault::NoAnswer),
+            ),
+            (
+                Code::ConverterConfigurationLost,
+                self.converter_fault == Some(ConverterFault::ConfigurationLost),
+            ),
+            (
+                Code::ConverterStale,
+                self.reading.validity.contains(Validity::STALE),
+            ),
+            (Code::RateImplausible, by_rate),
+            (Code::ConverterStuck, implausible && !by_rate),
+            (Code::MeterFrozen, compared.frozen),
+            (
+                Code::ChannelsDisagree,
+                disagree(compared.fast) || disagree(compared.slow),
+            ),
+            (Code::FlagImplausible, self.flag.implausible),
+            (Code::RangeChatter, self.chatter.active),
+            (Code::SupplyOutOfRange, supply_is_bad),
+            (
+                Code::TemperatureOutOfRange,
+                too_hot_or_cold(self.environment.sensor_temperature)
+                    || too_hot_or_cold(self.environment.board_temperature),
+            ),
+            (
+                Code::KeyCalibrationFailed,
+                matches!(self.key_outputs.phase, KeyPhase::Failed(_)),
+            ),
+            (Code::HvWithoutPermit, self.key_outputs.hv_without_permit),
+            (Code::SupplyCalibrationInvalid, has_no_relations),
+            (Code::ZeroDriftBeyondLimit, self.zero_beyond_limit),
+            (
+                Code::SocUncertain,
+                self.soc_reading.uncertainty > SOC_UNCERTAINTY_LIMIT,
+            ),
+            (Code::CellVoltageMissing, !self.vehicle.voltage_fresh),
+            (Code::VehicleStateMissing, !self.vehicle.state_fresh),
+            (Code::ChargeRestoredWithLoss, self.restored_with_loss),
+        ];
+        let mut set = CodeSet::EMPTY;
+        for (code, present) in rows {
+            set.set(code, present);
+        }
+        set
+    }
+
+    /// Causes against the current that the reading itself does not carry.
+    fn current_validity(&self, own: Validity) -> Validity {
+        own.and(self.effects.current).and_if(
+            self.zero.is_running()
+                || self.sweep.is_some()
+                || self.key_outputs.phase == KeyPhase::Taking,
+            Validity::CALIBRATING,
+        )
+    }
+
+    fn charge_validity(&self) -> Validity {
+        self.meter_causes.and(self.effects.charge)
+    }
+
+    fn soc_validity(&self) -> Validity {
+        self.effects
+            .soc
+            .and_if(!self.soc_reading.known, Validity::STALE)
+    }
+
+    fn averaged(&self, configuration: &Configuration) -> (Microamps, Validity, Option<Average>) {
+        match self.average.average(&configuration.average, self.now) {
+            Some(average) => (
+                average.current,
+                // A single bad conversion does not enter the average and so does not spoil it.
+                self.current_validity(Validity::VALID),
+                Some(average),
+            ),
+            None => (
+                self.reading.current,
+                self.current_validity(self.reading.validity.and(Validity::STALE)),
+                None,
+            ),
+        }
+    }
+}
+
+/// What goes out.
+impl Measurement {
+    /// The frame `Current`.
+    #[must_use]
+    pub fn current(&self) -> can::Current {
+        can::Current {
+            current: self.reading.current,
+            validity: self.current_validity(self.reading.validity),
+            range: self.reading.range,
+            conversions: self.conversions,
+            age: (self.conversions > 0).then(|| elapsed(self.reading.at, self.now)),
+        }
+    }
+
+    /// The frame `CurrentAverage`.
+    #[must_use]
+    pub fn current_average(&self, configuration: &Configuration) -> can::CurrentAverage {
+        let (average, validity, window) = self.averaged(configuration);
+        can::CurrentAverage {
+            average,
+            validity,
+            samples: window.map_or(0, |window| u16::from(window.count)),
+            span: window.map_or(Duration::from_ticks(0), |window| window.covers),
+        }
+    }
+
+    /// The frame `Charge`.
+    #[must_use]
+    pub fn charge(&self) -> can::Charge {
+        can::Charge {
+            charge: self.meter.charge_total,
+            validity: self.charge_validity(),
+            estimated: self.restored_with_loss
+                || self.meter.estimated_intervals > 0
+                || self.meter.gaps > 0,
+        }
+    }
+
+    /// The frame `MeterCurrent`.
+    #[must_use]
+    pub fn meter_current(&self) -> can::MeterCurrent {
+        can::MeterCurrent {
+            current: self.meter.mean_current,
+            validity: self
+                .charge_validity()
+                .and_if(self.meter.mean_over.is_zero(), Validity::STALE),
+            below_no_load: self.meter.below_no_load,
+            charge_uncertainty: Some(self.meter.uncertainty),
+        }
+    }
+
+    /// The frame `StateOfCharge`.
+    #[must_use]
+    pub fn state_of_charge(&self) -> can::StateOfCharge {
+        let known = self.soc_reading.known;
+        can::StateOfCharge {
+            state_of_charge: self.soc_reading.presented,
+            validity: self.soc_validity(),
+            uncertainty: known.then_some(self.soc_reading.uncertainty),
+            remaining: known.then_some(self.soc_reading.remaining),
+        }
+    }
+
+    /// The frame `Throughput`.
+    #[must_use]
+    pub fn throughput(&self) -> can::Throughput {
+        can::Throughput {
+            discharged: self.soc_reading.discharged,
+            charged: self.soc_reading.charged,
+        }
+    }
+
+    /// The frame `Environment`.
+    #[must_use]
+    pub fn environment(&self) -> can::Environment {
+        let missing = self.environment_is_missing();
+        let supply = self.prepared.supply.unwrap_or_default();
+        let validity =
+            |is_there: bool| Validity::VALID.and_if(missing || !is_there, Validity::STALE);
+        can::Environment {
+            supply: Millivolts(clamp_i32(div_round(i64::from(supply.get()), 1_000))),
+            supply_validity: self.supply_validity(),
+            sensor_temperature: self.environment.sensor_temperature.unwrap_or_default(),
+            sensor_temperature_validity: validity(self.environment.sensor_temperature.is_some()),
+            board_temperature: self.environment.board_temperature.unwrap_or_default(),
+            board_temperature_validity: validity(self.environment.board_temperature.is_some()),
+        }
+    }
+
+    fn supply_validity(&self) -> Validity {
+        Validity::VALID
+            .and_if(
+                self.environment_is_missing() || self.prepared.supply.is_none(),
+                Validity::STALE,
+            )
+            .and_if(
+                self.diagnosis.active().contains(Code::SupplyOutOfRange),
+                Validity::SUPPLY,
+            )
+    }
+
+    /// The frame `BoardState`. Counters of the CAN controller are its owner's.
+    #[must_use]
+    pub fn board_state(&self, bus_offs: u16, refused: u32) -> can::BoardState {
+        can::BoardState {
+            key: Some(self.key_outputs.key),
+            high_voltage: Some(self.vehicle.hv_feedback),
+            permit: self.key_outputs.hv_permit,
+            key_calibration: Some(self.key_outputs.phase),
+            range: self.history.range,
+            cell_voltage_fresh: self.vehicle.voltage_fresh,
+            vehicle_state_fresh: self.vehicle.state_fresh,
+            edges: self.history.edges,
+            coalesced: self.history.coalesced,
+            estimated_intervals: self.meter.estimated_intervals,
+            bus_offs,
+            refused,
+        }
+    }
+
+    /// All diagnoses.
+    #[must_use]
+    pub const fn diagnosis(&self) -> &Diagnosis {
+        &self.diagnosis
+    }
+
+    /// What bridges a gap of the meter: the averaged current while it is valid.
+    #[must_use]
+    pub fn bridge(&self, configuration: &Configuration) -> GapBridge {
+        match self.averaged(configuration) {
+            (current, validity, Some(_)) if validity.is_valid() => GapBridge::MeanCurrent(current),
+            _ => GapBridge::Unknown,
+        }
+    }
+
+    /// What must survive a reset.
+    #[must_use]
+    pub fn retained(&self, sequence: u32) -> RetainedState {
+        RetainedState {
+            sequence,
+            charge_total: self.meter.charge_total,
+            soc: self.soc.retained(),
+            key_factors: self.key.factors(),
+        }
+    }
+
+    /// One line of the flash log.
+    #[must_use]
+    pub fn log_record(&self, configuration: &Configuration, boot: u32) -> LogRecord {
+        let (current, current_validity, _) = self.averaged(configuration);
+        let environment = self.environment();
+        LogRecord {
+            boot,
+            uptime_ms: self.now.as_ticks() / 1_000,
+            current,
+            charge: self.meter.charge_total,
+            soc: self.soc_reading.presented,
+            current_validity,
+            charge_validity: self.charge_validity(),
+            soc_validity: self.soc_validity(),
+            diagnoses: self.diagnosis.reported().bits(),
+            supply: environment.supply,
+            temperature: environment.sensor_temperature,
+        }
+    }
+
+    /// Fills in everything that is known here; what only the owners of the hardware know stays as it is.
+    pub fn fill(&self, configuration: &Configuration, readings: &mut Readings) {
+        let (average, average_validity, _) = self.averaged(configuration);
+        let environment = self.environment();
+        let compared = self.compare.report();
+        let (taken, of) = self
+            .zero
+            .progress(&configuration.zero_drift)
+            .map_or((0, 1), |progress| (progress.taken, progress.of));
+        let points = self.sweep.map_or((0, 0), |sweep| sweep.points());
+        readings.activity = if self.zero.is_running() {
+            Activity::ZeroDrift
+        } else if self.sweep.is_some() {
+            Activity::SupplyCalibration
+        } else if self.key_outputs.phase == KeyPhase::Taking {
+            Activity::KeyCalibration
+        } else {
+            Activity::None
+        };
+        readings.activity_progress = percent(taken, of);
+        (readings.command_state, readings.command_reason) = self.order_outcome;
+        readings.supply_points = [points.0, points.1];
+        readings.key_calibration_state = key_phase_number(self.key_outputs.phase);
+        readings.current = self.reading.current;
+        readings.current_average = average;
+        readings.meter_current = self.meter.mean_current;
+        readings.current_validity = self.current_validity(self.reading.validity);
+        readings.average_validity = average_validity;
+        readings.charge_validity = self.charge_validity();
+        readings.conversions = self.conversions;
+        readings.sensor_voltage = self.reading.volts;
+        readings.range = self.history.range;
+        readings.range_edges = self.history.edges;
+        readings.coalesced_edges = u32::from(self.history.coalesced);
+        readings.chatter = self.chatter.episodes;
+        readings.charge = self.meter.charge_total;
+        readings.charge_in = self.meter.charge_in;
+        readings.charge_out = self.meter.charge_out;
+        readings.charge_uncertainty = self.meter.uncertainty;
+        readings.estimated_intervals = self.meter.estimated_intervals;
+        if let Outcome::Disagree { difference, bound } = compared.slow {
+            (readings.channel_difference, readings.channel_bound) = (difference, bound);
+        }
+        readings.soc = self.soc_reading.presented;
+        readings.soc_uncertainty = self.soc_reading.uncertainty;
+        readings.soc_validity = self.soc_validity();
+        readings.remaining_charge = self.soc_reading.remaining;
+        readings.soc_anchors = self.soc_reading.anchors;
+        let cell = self.cell_voltage.map(|cell| cell.voltage).unwrap_or_default();
+        readings.cell_voltage = Millivolts(clamp_i32(div_round(i64::from(cell.get()), 1_000)));
+        readings.pack_voltage = self.pack_voltage.unwrap_or_default();
+        readings.cell_validity =
+            Validity::VALID.and_if(!self.vehicle.voltage_fresh, Validity::STALE);
+        readings.supply = self.prepared.supply.unwrap_or_default();
+        readings.supply_validity = environment.supply_validity;
+        readings.network_voltage = self.environment.network.unwrap_or_default();
+        readings.mcu_supply = self.environment.controller_supply.unwrap_or_default();
+        readings.sensor_temperature = environment.sensor_temperature;
+        readings.temperature_validity = environment.sensor_temperature_validity;
+        readings.board_temperature = environment.board_temperature;
+        readings.key_state = self.key_outputs.key as u16;
+        readings.high_voltage_on = !self.high_voltage_is_off();
+        readings.high_voltage_permit = self.key_outputs.hv_permit;
+        readings.diagnoses_active = self.diagnosis.active().bits();
+        readings.diagnoses_latched = self.diagnosis.latched().bits();
+    }
+
+    /// The comparison of the two channels.
+    #[must_use]
+    pub const fn compare_report(&self) -> CompareReport {
+        self.compare.report()
+    }
+
+    /// Conversions that were not valid, since the start.
+    #[must_use]
+    pub const fn invalid_conversions(&self) -> u32 {
+        self.invalid_conversions
+    }
+}
+
+/// The Hall output behind a network voltage: (V − 1.65 V) / 0.225.
+fn hall_voltage(network: Microvolts) -> Microvolts {
+    let (gain, per) = design::NETWORK_GAIN;
+    let above = network.saturating_sub(crate::open_sensor::network_output(Microvolts::ZERO));
+    Microvolts(clamp_i32(mul_div(i64::from(above.get()), per, gain)))
+}
+
+fn percent(taken: u16, of: u16) -> u16 {
+    let share = u32::from(taken) * 100 / u32::from(of.max(1));
+    u16::try_from(share.min(100)).unwrap_or(100)
+}
+
+/// The number of a phase on Modbus, as on CAN.
+const fn key_phase_number(phase: KeyPhase) -> u16 {
+    match phase {
+        KeyPhase::Off => 0,
+        KeyPhase::Taking => 1,
+        KeyPhase::Taken => 2,
+        KeyPhase::Failed(_) => 3,
+        KeyPhase::Resumed => 4,
+        KeyPhase::Disabled => 5,
+    }
+}

@@ -1,0 +1,328 @@
+//! The five designs, on the whole measuring logic over an ideal board: what goes out on the bus is compared with what
+//! flowed.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss
+)]
+
+#[path = "support/host_board.rs"]
+mod host_board;
+#[path = "support/ideal_board.rs"]
+mod ideal_board;
+
+use core_logic::configuration::Configuration;
+use core_logic::diagnosis::Code;
+use core_logic::error_budget::{ProfileSummary, charge_bound};
+use core_logic::key_calibration::KeyPhase;
+use core_logic::measurement::{Order, Refusal};
+use core_logic::open_sensor::network_output_open;
+use core_logic::range::Range;
+use core_logic::units::{Duration, Microamps, Microvolts};
+use core_logic::validity::Validity;
+use host_board::{HostBoard, Step};
+use ideal_board::{Event, Row, Timing};
+use proptest::prelude::*;
+
+fn rows(points: &[(f64, f64)]) -> Vec<Row> {
+    points
+        .iter()
+        .map(|&(t_s, current_a)| Row {
+            t_s,
+            current_a,
+            cell_v: 3.7,
+        })
+        .collect()
+}
+
+fn board(rows: &[Row]) -> HostBoard<'_> {
+    HostBoard::new(rows, Timing::default(), Configuration::default())
+}
+
+/// The bound of the error budget for what has run so far, without the sensors' own errors.
+fn ideal_bound_c(board: &HostBoard<'_>, rows: &[Row]) -> f64 {
+    let duration = board.world.elapsed_s();
+    let mean_square = rows.iter().map(|row| row.current_a.powi(2)).sum::<f64>() / rows.len() as f64;
+    let bound = charge_bound(&ProfileSummary {
+        duration: Duration::from_ticks((duration * 1e6) as u64),
+        in_large: board.in_large(),
+        rms_current: Microamps((mean_square.sqrt() * 1e6) as i32),
+        edges: board.world.edges as u32,
+        below_no_load: Duration::from_ticks(0),
+        chatter: Duration::from_ticks(0),
+        chatter_squares: 0,
+        chatter_runs: 0,
+    });
+    bound.ideal_sensor.get() as f64 * 1e-9
+}
+
+/// D0: right currents on both sides of ±53.33 A, in both directions, and never a valid one from a spoiled conversion.
+#[test]
+fn d0_switches_at_53_33_amps_in_both_directions_with_right_currents_on_both_sides() {
+    let rows = rows(&[
+        (0.0, 0.0),
+        (2.0, 50.0),
+        (4.0, 60.0),
+        (6.0, 400.0),
+        (8.0, 60.0),
+        (10.0, 40.0),
+        (12.0, -40.0),
+        (14.0, -60.0),
+        (16.0, -400.0),
+        (18.0, -60.0),
+        (20.0, 0.0),
+        (21.0, 0.0),
+    ]);
+    let mut board = board(&rows);
+    let mut valid = [0, 0];
+    let mut spoiled = 0;
+    let mut flips = Vec::new();
+    while let Some(step) = board.step() {
+        match step {
+            Step::Event(Event::Edge { .. }) => flips.push(board.world.current_a()),
+            Step::Event(Event::Conversion { started_us, .. }) => {
+                let sent = board.measurement.current();
+                if sent.validity.contains(Validity::RANGE_CHANGE) {
+                    spoiled += 1;
+                    continue;
+                }
+                if !sent.validity.is_valid() {
+                    continue; // supply not known in the first 10 ms
+                }
+                // A conversion is the mean over its time; the current is linear but at the corners.
+                let now = board.world.current_a();
+                let length_s = (board.now_us - started_us) as f64 * 1e-6;
+                let code_a = if sent.range == Range::Small { 0.0163 } else { 0.163 };
+                let error = f64::from(sent.current.get()) * 1e-6 - now;
+                assert!(
+                    error.abs() < code_a + 200.0 * length_s,
+                    "{error} A at {now} A"
+                );
+                valid[sent.range as usize] += 1;
+            }
+            _ => {}
+        }
+    }
+    let expected = [53.33, 52.80, -53.33, -52.80];
+    assert_eq!(flips.len(), 4, "{flips:?}");
+    for (flip, expected) in flips.iter().zip(expected) {
+        assert!((flip - expected).abs() < 0.01, "{flips:?}");
+    }
+    assert!((4..=8).contains(&spoiled), "{spoiled}");
+    assert!(valid[0] > 300 && valid[1] > 250, "{valid:?}");
+}
+
+/// D1: the charge of a mixed profile, within what the error budget states for sensors without error.
+#[test]
+fn d1_counts_the_charge_of_a_mixed_profile_within_the_error_budget() {
+    let points: Vec<(f64, f64)> = (0..2_000)
+        .map(|i| {
+            let t = f64::from(i) * 0.5;
+            (t, 120.0 * (t * 0.11).sin() + 90.0 * (t * 0.7).sin() + 25.0)
+        })
+        .collect();
+    let rows = rows(&points);
+    let mut board = board(&rows);
+    board.run();
+    let (error, bound) = (board.charge_error_c(), ideal_bound_c(&board, &rows));
+    assert!(board.world.edges > 200, "{}", board.world.edges);
+    assert!(error.abs() <= bound, "{error} C, bound {bound} C");
+    assert!(error.abs() < 1e-3 * board.world.charge_c, "{error} of {}", board.world.charge_c);
+    assert!(board.measurement.charge().validity.is_valid());
+}
+
+/// D2: a zero drift taken by order makes current *and* charge read zero, and survives in the configuration.
+#[test]
+fn d2_zero_now_cancels_the_drift_of_both_channels() {
+    // The sensor's drift of 1.5 A, as the ideal board knows it: a current that "flows" with the high voltage off.
+    let rows = rows(&[(0.0, 1.5), (60.0, 1.5)]);
+    let mut board = board(&rows);
+    board.vehicle.acc_line = false;
+    board.vehicle.hv_feedback = false;
+    assert!(board.run_until(|board| board.now_us > 3_000_000));
+    let configuration = board.configuration;
+    assert_eq!(board.measurement.order(&configuration, Order::ZeroNow), Ok(()));
+    assert_eq!(
+        board.measurement.order(&configuration, Order::ZeroNow),
+        Err(Refusal::Busy)
+    );
+    assert!(board.run_until(|board| board.configuration.zero_drift.value.small != Microamps::ZERO));
+    let drift = board.configuration.zero_drift.value.small.get();
+    assert!((drift - 1_500_000).abs() < 8_200, "{drift} µA: half a code is 8.1 mA");
+    assert_eq!(board.configuration.zero_drift.value.large, Microamps::ZERO);
+    let (begin_c, begin_s) = (
+        board.meter.report().charge_total.get() as f64 * 1e-9,
+        board.world.elapsed_s(),
+    );
+    board.run();
+    let mean = (board.meter.report().charge_total.get() as f64 * 1e-9 - begin_c)
+        / (board.world.elapsed_s() - begin_s);
+    assert!(mean.abs() < 8.5e-3, "{mean} A are still counted");
+    assert!(board.measurement.current().current.get().abs() < 8_200);
+}
+
+#[test]
+fn d2_zero_now_is_refused_while_current_flows_or_the_high_voltage_is_on() {
+    let rows = rows(&[(0.0, 20.0), (10.0, 20.0)]);
+    let mut board = board(&rows);
+    assert!(board.run_until(|board| board.now_us > 3_000_000));
+    let configuration = board.configuration;
+    assert_eq!(
+        board.measurement.order(&configuration, Order::ZeroNow),
+        Err(Refusal::HighVoltage)
+    );
+    board.vehicle.acc_line = false;
+    board.vehicle.hv_feedback = false;
+    assert!(board.run_until(|board| board.now_us > 5_000_000));
+    assert_eq!(
+        board.measurement.order(&configuration, Order::ZeroNow),
+        Err(Refusal::CurrentFlows)
+    );
+    assert_eq!(board.configuration.zero_drift.value.small, Microamps::ZERO);
+}
+
+/// D3: an open sensor is found within two readings, reported on the bus, and its current is not turned into 0 A.
+#[test]
+fn d3_finds_the_open_small_sensor_and_marks_the_current() {
+    let rows = rows(&[(0.0, 20.0), (20.0, 20.0)]);
+    let mut board = board(&rows);
+    assert!(board.run_until(|board| board.now_us > 2_000_000));
+    assert!(board.measurement.current().validity.is_valid());
+    board.network = Some(network_output_open());
+    let opened_at = board.now_us;
+    assert!(board.run_until(|board| board
+        .measurement
+        .diagnosis()
+        .active()
+        .contains(Code::OpenSensor)));
+    assert!(board.now_us - opened_at <= 40_000, "{} µs", board.now_us - opened_at);
+    let sent = board.measurement.current();
+    assert!(sent.validity.contains(Validity::OPEN));
+    assert!(board.measurement.charge().validity.contains(Validity::OPEN));
+    // The bus carries "not available", which is no current at all.
+    let frame = sent.encode(0);
+    let raw = core_logic::can::layout::current::VALUE
+        .get(core_logic::can::layout::word(frame.data));
+    assert_eq!(
+        Some(raw),
+        core_logic::can::layout::current::VALUE.not_available
+    );
+}
+
+/// D4: the permit waits until both factors are taken, and the current then reads 0 A in ACC.
+#[test]
+fn d4_holds_the_permit_until_the_factors_are_taken_and_then_reads_zero() {
+    // 2.49 V with key OFF and 2.48 V in ACC (D4's example), as currents of the small sensor.
+    let amps = |volts: f64| (volts - 2.5) * 60.0 / 2.25;
+    let rows = rows(&[
+        (0.0, amps(2.49)),
+        (3.0, amps(2.49)),
+        (3.0, amps(2.48)),
+        (20.0, amps(2.48)),
+    ]);
+    let mut board = board(&rows);
+    board.vehicle.acc_line = false;
+    board.vehicle.hv_feedback = false;
+    assert!(board.run_until(|board| board.now_us >= 3_000_000));
+    board.vehicle.acc_line = true;
+    let mut permitted_before_taken = false;
+    let mut taken_at = None;
+    let mut permitted_at = None;
+    while let Some(step) = board.step() {
+        if let Step::Tick(tick) = step {
+            let taken = board.measurement.board_state(0, 0).key_calibration == Some(KeyPhase::Taken);
+            permitted_before_taken |= tick.hv_permit && !taken;
+            if taken && taken_at.is_none() {
+                taken_at = Some(board.now_us);
+            }
+            if tick.hv_permit && permitted_at.is_none() {
+                permitted_at = Some(board.now_us);
+            }
+        }
+    }
+    assert!(!permitted_before_taken);
+    assert_eq!(taken_at, permitted_at);
+    let delay_ms = (permitted_at.unwrap() - 3_000_000) / 1_000;
+    assert!((500..1_500).contains(&delay_ms), "{delay_ms} ms");
+    let factors = board.configuration.key_factors;
+    assert!((factors.a.get() - 10_000).abs() <= 610, "a = {:?}", factors.a);
+    assert!((factors.k_ppb - 1_004_016_064).abs() < 250_000, "k = {}", factors.k_ppb);
+    let current = board.measurement.current().current.get();
+    assert!(current.abs() < 16_300, "{current} µA in ACC, one code is 16.3 mA");
+}
+
+/// D2 and D4: the state of charge follows the meter and is anchored after a rest.
+#[test]
+fn soc_follows_the_charge_and_is_anchored_after_a_rest() {
+    let mut configuration = Configuration::default();
+    configuration.soc.capacity_mah = 1_000;
+    let rest_s = f64::from(configuration.soc.rest_time_s);
+    let rows = rows(&[
+        (0.0, 0.0),
+        (rest_s + 20.0, 0.0),
+        (rest_s + 20.0, 36.0),
+        (rest_s + 30.0, 36.0),
+        (rest_s + 30.0, 0.0),
+        (rest_s + 32.0, 0.0),
+    ]);
+    let mut board = HostBoard::new(&rows, Timing::default(), configuration);
+    assert!(board.run_until(|board| board.measurement.state_of_charge().validity.is_valid()));
+    assert!(board.world.elapsed_s() >= rest_s);
+    let anchored = board.measurement.state_of_charge().state_of_charge.get();
+    board.run();
+    let left = board.measurement.state_of_charge().state_of_charge.get();
+    // 36 A for 10 s out of 3,600 C are 10 %.
+    assert!((anchored - left - 100_000).abs() < 300, "{anchored} → {left}");
+}
+
+/// A supply outside its limits invalidates everything that hangs on it, and says so.
+#[test]
+fn a_bad_supply_is_reported_and_never_measured_with() {
+    let rows = rows(&[(0.0, 10.0), (10.0, 10.0)]);
+    let mut board = board(&rows);
+    assert!(board.run_until(|board| board.now_us > 1_000_000));
+    assert!(board.measurement.current().validity.is_valid());
+    for supply in [Some(Microvolts::from_millivolts(4_300)), None] {
+        board.supply = supply;
+        let until = board.now_us + 500_000;
+        assert!(board.run_until(|board| board.now_us > until));
+        assert!(board.measurement.diagnosis().active().contains(Code::SupplyOutOfRange));
+        assert!(board.measurement.current().validity.contains(Validity::SUPPLY));
+        board.supply = Some(Microvolts::from_millivolts(5_000));
+        let until = board.now_us + 1_500_000;
+        assert!(board.run_until(|board| board.now_us > until));
+        assert!(board.measurement.current().validity.is_valid());
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    /// Any profile, polling and snapshot latency: the charge on the bus is what flowed, within the budget.
+    #[test]
+    fn charge_is_conserved_for_any_profile(
+        points in proptest::collection::vec((0.05f64..3.0, -550.0f64..550.0), 10..120),
+        poll_ms in 5.0f64..200.0,
+        latency_us in 20.0f64..100.0,
+    ) {
+        let mut t = 0.0;
+        let mut profile = vec![Row { t_s: 0.0, current_a: 0.0, cell_v: 3.7 }];
+        for (dt, current_a) in points {
+            t += dt;
+            profile.push(Row { t_s: t, current_a, cell_v: 3.7 });
+        }
+        let timing = Timing {
+            meter_poll_s: poll_ms * 1e-3,
+            snapshot_latency_s: latency_us * 1e-6,
+            ..Timing::default()
+        };
+        let mut board = HostBoard::new(&profile, timing, Configuration::default());
+        board.run();
+        let (error, bound) = (board.charge_error_c(), ideal_bound_c(&board, &profile));
+        prop_assert!(error.abs() <= bound, "{} C, bound {} C", error, bound);
+    }
+}
