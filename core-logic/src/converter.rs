@@ -527,7 +527,7 @@ pub struct Adc1Sample {
 }
 
 /// What was going on around a sample.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct SampleContext {
     /// The sensor that was selected. [`Range::Small`] for a front end with one sensor.
@@ -536,6 +536,20 @@ pub struct SampleContext {
     pub spoiled_by_edge: bool,
     /// The energy meter's latest mean current, when it has one.
     pub meter_mean: Option<Microamps>,
+    /// When the time began over which that is the mean.
+    pub meter_mean_begun: Instant,
+}
+
+impl Default for SampleContext {
+    /// The small sensor, no edge, no meter.
+    fn default() -> Self {
+        Self {
+            range: Range::Small,
+            spoiled_by_edge: false,
+            meter_mean: None,
+            meter_mean_begun: Instant::from_ticks(0),
+        }
+    }
 }
 
 /// A current with its validity.
@@ -797,8 +811,8 @@ impl Converter {
                 meter: None,
             }),
         };
-        // The meter's mean reaches back before the run at first: a step that ended in this run is not a movement in it.
-        let counts = elapsed(run.since, at).as_ticks() >= design::STUCK_METER_LAG_US;
+        // A mean that reaches back before the run holds the step that the run began with: no movement in it.
+        let counts = context.meter_mean_begun >= run.since;
         if let (true, Some(mean)) = (counts, context.meter_mean) {
             let (low, high) = run.meter.unwrap_or((mean, mean));
             run.meter = Some((low.min(mean), high.max(mean)));
@@ -899,7 +913,10 @@ pub(crate) mod tests {
                 configuration,
                 code,
             };
-            let context = self.context;
+            let context = SampleContext {
+                meter_mean_begun: at(self.now - self.now.min(100_000)),
+                ..self.context
+            };
             self.converter
                 .on_sample(&self.config, &self.coefficients, &sample, &context)
                 .unwrap()
@@ -1437,7 +1454,7 @@ pub(crate) mod tests {
             run(&|index| Some(Microamps(-500_000 * index as i32))),
             Some(7)
         );
-        // What the meter said in the first 100 ms may be older than the run: samples 0 to 3.
+        // A mean over the last 100 ms reaches back before the run at samples 0 to 3.
         assert_eq!(
             run(&|index| Some(Microamps::from_amps(if index < 4 { 50 } else { 20 }))),
             None
@@ -1454,16 +1471,17 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn the_meter_counts_from_100_ms_after_the_first_of_the_codes() {
+    fn a_mean_counts_that_began_no_earlier_than_the_first_of_the_codes() {
         for (second, third, expected) in [(99_999, 200_000, false), (100_000, 200_000, true)] {
             let config = ConverterConfig {
                 stuck_count: 3,
                 ..CONFIG
             };
             let mut converter = Converter::new();
-            let mut step = |us, amps| {
+            let mut step = |us: u64, amps| {
                 let context = SampleContext {
                     meter_mean: Some(Microamps::from_amps(amps)),
+                    meter_mean_begun: at(us - us.min(100_000)),
                     ..SampleContext::default()
                 };
                 converter.is_stuck(&config, 4_096, at(us), &context)
@@ -1797,6 +1815,7 @@ pub(crate) mod tests {
                     range: if large { Range::Large } else { Range::Small },
                     spoiled_by_edge: byte & 1 == 1,
                     meter_mean: mean.map(Microamps),
+                    meter_mean_begun: at(finished / 2),
                 };
                 let configuration = if expected { config.expected_configuration() } else { byte };
                 let (started, finished) = (at(started), at(finished));

@@ -112,8 +112,6 @@ pub const STUCK_COUNT: u16 = 32;
 pub const STUCK_MOVEMENT_SMALL: Microamps = Microamps::from_amps(1);
 /// The same for the large sensor: 2.5 · 651 mA + 2 · 3.4 A, rounded up.
 pub const STUCK_MOVEMENT_LARGE: Microamps = Microamps::from_amps(10);
-/// The meter's mean current may reach back this far: its poll, one period of the mean, and margin for a missed one.
-pub const STUCK_METER_LAG_US: u64 = 5 * METER_POLL_MS * 1_000;
 
 /// Sliding average: eight conversions, 250 ms at 32 SPS (D2 leaves the length settable; *assumed*).
 pub const AVERAGE_LENGTH: u8 = 8;
@@ -167,12 +165,14 @@ pub const CHANNEL_1_SCALE: (i64, i64) = (2, 9);
 /// product · (V2 / 0.5 V) · CLKIN / 4 / 2²⁵ = 8,949 counts/s.
 pub const METER_COUNTS_PER_SECOND_Q32: u64 = {
     let product = METER_DC_FULL_SCALE_PRODUCT as u128;
-    let share = METER_CHANNEL_2.get() as u128;
-    let of = METER_FULL_SCALE_INPUT.get() as u128;
-    let accumulations_times_4 = METER_CLKIN_HZ as u128;
-    ((product * share * accumulations_times_4 << 32)
-        / (of * METER_CLOCKS_PER_ACCUMULATION as u128)
-        >> METER_HIDDEN_BITS) as u64
+    let share = METER_CHANNEL_2.get().unsigned_abs() as u128;
+    let of = METER_FULL_SCALE_INPUT.get().unsigned_abs() as u128;
+    let rate_times_of = product * share * METER_CLKIN_HZ as u128;
+    let per_second = (rate_times_of << 32) / (of * METER_CLOCKS_PER_ACCUMULATION as u128);
+    #[expect(clippy::cast_possible_truncation, reason = "8,949 · 2³²")]
+    {
+        (per_second >> METER_HIDDEN_BITS) as u64
+    }
 };
 
 /// No-load threshold: products below 0.001 % of the full-scale output are not counted (ADE7753 Rev C, features;

@@ -641,6 +641,10 @@ mod tests {
         );
         assert_eq!(car.calibration.factors(), factors);
         assert_eq!(factors.apply(D4_EXAMPLE_ACC), SENSOR_ZERO);
+        // Once per key cycle, also while the high voltage still waits.
+        car.voltage = Some(Microvolts(2_470_000));
+        assert_eq!(car.run_ms(1_000).1, None);
+        assert_eq!(car.calibration.factors(), factors);
         let supply = crate::design_parameters::SENSOR_NOMINAL_SUPPLY;
         let current = FrontEnd::default().current(
             factors.apply(D4_EXAMPLE_ACC),
@@ -904,6 +908,14 @@ mod tests {
             off(|car| car.voltage = Some(Microvolts(-2_490_000))),
             Some(KeyRefusal::KOutOfLimits(-2_004_016))
         );
+        // An output of 0 V has no factor, however wide the limit.
+        assert_eq!(
+            off(|car| {
+                car.config.max_k_deviation_ppm = 1_000_000;
+                car.voltage = Some(Microvolts(0));
+            }),
+            Some(KeyRefusal::KOutOfLimits(-1_000_000))
+        );
         // Exactly 2 %: 2.5 V / 2.5 V · 1.02.
         assert_eq!(
             off(|car| {
@@ -993,6 +1005,10 @@ mod tests {
         assert!(!car.step().hv_without_permit);
         assert!(!car.wait_ms(1_000).hv_without_permit);
         assert!(car.wait_ms(1).hv_without_permit);
+        // The time counts from the start, not from the first look.
+        let mut car = Car::new(config());
+        car.inputs.hv_feedback = true;
+        assert!(car.wait_ms(1_001).hv_without_permit);
     }
 
     #[test]

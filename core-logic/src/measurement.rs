@@ -167,6 +167,8 @@ pub enum Refusal {
     SupplyUnknown = 12,
     /// The supply calibration refused the point or the result.
     SupplyCalibration = 13,
+    /// The key is not OFF.
+    KeyNotOff = 14,
 }
 
 impl From<ZeroRefusal> for Refusal {
@@ -200,6 +202,9 @@ pub struct Tick {
 const SUPPLY_SHIFT: u32 = 4;
 /// Environment readings older than this are missing.
 const ENVIRONMENT_TIMEOUT: Duration = Duration::from_ticks(500_000);
+/// The first conversion is there by then: the chip's first result after power-up is discarded, and a conversion at
+/// 8 samples a second takes 125 ms.
+const START_UP: Duration = Duration::from_ticks(500_000);
 /// Above this the state of charge is reported as uncertain: a tenth of the capacity.
 pub const SOC_UNCERTAINTY_LIMIT: Ppm = Ppm(100_000);
 
@@ -250,6 +255,7 @@ pub struct Measurement {
     found: Option<Found>,
     order_outcome: (CommandState, u16),
     restored_with_loss: bool,
+    started: Instant,
     now: Instant,
 }
 
@@ -430,6 +436,7 @@ impl Measurement {
             found: None,
             order_outcome: (CommandState::None, 0),
             restored_with_loss,
+            started: now,
             now,
         };
         if let Some(state) = retained {
@@ -653,6 +660,10 @@ impl Measurement {
                 if !self.high_voltage_is_off() || self.key_outputs.hv_permit {
                     return Err(Refusal::HighVoltage);
                 }
+                // VC1 is taken with key OFF only: begun in ACC it could but fail.
+                if self.key_outputs.key != KeyState::Off {
+                    return Err(Refusal::KeyNotOff);
+                }
                 self.key = KeyCalibration::new(self.key.factors(), self.now);
                 Ok(CommandState::Running)
             }
@@ -666,10 +677,7 @@ impl Measurement {
                 };
                 let sweep = self.sweep.ok_or(Refusal::SupplyCalibration)?;
                 let calibrated = sweep
-                    .finish(
-                        &configuration.supply_calibration,
-                        i32::try_from(sensor.turns).unwrap_or(i32::MAX),
-                    )
+                    .finish(&configuration.supply_calibration, sensor.turns)
                     .map_err(|_| Refusal::SupplyCalibration)?;
                 self.sweep = None;
                 self.found = Some(Found::SupplyRelations(calibrated.relations));
@@ -741,6 +749,7 @@ impl Measurement {
             spoiled_by_edge: two_ranges
                 && history.conversion_spoiled(started, configuration.converter.settling()),
             meter_mean: self.meter_mean(),
+            meter_mean_begun: self.meter.mean_begun,
         }
     }
 
@@ -878,6 +887,11 @@ impl Measurement {
             .is_none_or(|at| elapsed(at, self.now) > ENVIRONMENT_TIMEOUT)
     }
 
+    /// Before the first conversion, and no longer than it may take: nothing is there yet, and nothing has failed.
+    fn is_starting(&self) -> bool {
+        self.conversions == 0 && elapsed(self.started, self.now) < START_UP
+    }
+
     fn conditions(&self, configuration: &Configuration) -> CodeSet {
         let two_ranges = configuration.front_end.has_two_ranges();
         let selected = if two_ranges {
@@ -929,7 +943,7 @@ impl Measurement {
             ),
             (
                 Code::ConverterStale,
-                self.reading.validity.contains(Validity::STALE),
+                self.reading.validity.contains(Validity::STALE) && !self.is_starting(),
             ),
             (Code::RateImplausible, by_rate),
             (Code::ConverterStuck, implausible && !by_rate),

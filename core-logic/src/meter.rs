@@ -273,6 +273,8 @@ pub struct MeterReport {
     pub mean_current: Microamps,
     /// That window's length; zero before the first is complete.
     pub mean_over: Duration,
+    /// When that window began.
+    pub mean_begun: Instant,
     /// The mean is below the no-load threshold: the meter may be counting nothing at all.
     pub below_no_load: bool,
     /// The meter does not count; the charge stands still until it is restarted.
@@ -301,6 +303,7 @@ impl Default for MeterReport {
             resolution: Nanocoulombs::ZERO,
             mean_current: Microamps::ZERO,
             mean_over: Duration::from_ticks(0),
+            mean_begun: Instant::from_ticks(0),
             below_no_load: false,
             lost: false,
             rejected: 0,
@@ -425,6 +428,7 @@ pub struct MeterChannel {
     window: Option<(Instant, Accumulator)>,
     mean_current: Microamps,
     mean_over: Duration,
+    mean_begun: Instant,
     lost: bool,
     consecutive_rejections: u8,
     rejected: u32,
@@ -452,6 +456,7 @@ impl MeterChannel {
             window: None,
             mean_current: Microamps::ZERO,
             mean_over: Duration::from_ticks(0),
+            mean_begun: Instant::from_ticks(0),
             lost: false,
             consecutive_rejections: 0,
             rejected: 0,
@@ -601,6 +606,7 @@ impl MeterChannel {
             resolution: self.config.charge_per_count(range),
             mean_current: self.mean_current,
             mean_over: self.mean_over,
+            mean_begun: self.mean_begun,
             below_no_load: !self.mean_over.is_zero()
                 && magnitude < self.config.no_load_current(range),
             lost: self.lost,
@@ -885,6 +891,7 @@ impl MeterChannel {
         let ticks = i64::try_from(length.as_ticks()).unwrap_or(i64::MAX);
         self.mean_current = Microamps(clamp_i32(mul_div(counted, 1_000, ticks)));
         self.mean_over = length;
+        self.mean_begun = begin;
         self.window = Some((now, self.total));
     }
 }

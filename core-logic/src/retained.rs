@@ -506,6 +506,7 @@ mod tests {
             Ok(largest_state())
         );
         const { assert!(MAX_STATE_BYTES <= SLOT_BYTES) };
+        assert_eq!(to_words(&largest_state().to_slot()).len() * 4, SLOT_BYTES);
         // A line of the log as it usually is.
         let usual = LogRecord {
             boot: 12,

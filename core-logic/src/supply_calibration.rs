@@ -458,6 +458,12 @@ mod tests {
                 (done.zero_residual.get(), done.loaded_residual.get()),
                 (0, 0)
             );
+            // A residual at the limit is allowed, also at the limit 0.
+            let strict = SupplyCalibrationConfig {
+                max_residual: Microvolts::ZERO,
+                ..config()
+            };
+            assert_eq!(calibration.finish(&strict, TURNS), Ok(done));
             let front_end = FrontEnd::ClosedLoop(ClosedLoop {
                 turns: TURNS,
                 relations,
