@@ -1,0 +1,137 @@
+//! ADC1: sensor supply, open-sensor network, and the MCU's own temperature and reference.
+//!
+//! The converter's full scale is VDDA, which the 3.3 V regulator knows to a few per cent only; the factory's value of
+//! the internal reference takes that out. Three conversions per call, 33 µs in all, each with a bounded wait.
+
+use core_logic::units::{Microvolts, MilliCelsius, clamp_i32, div_round};
+use stm32f4xx_hal::{
+    pac::{ADC_COMMON, ADC1, RCC},
+    rcc::{Enable, Reset},
+    signature::{VrefCal, VtempCal30, VtempCal110},
+};
+
+use crate::time;
+
+/// PC0.
+const SUPPLY: u8 = 10;
+/// PC1.
+const NETWORK: u8 = 11;
+const TEMPERATURE: u8 = 16;
+const REFERENCE: u8 = 17;
+
+/// The longest conversion takes 480 + 12 clocks of 21 MHz: 23.4 µs.
+const CONVERSION_LIMIT_US: u32 = 60;
+/// The board halves the sensor's supply.
+const SUPPLY_DIVIDER: i64 = 2;
+/// VDDA at which the factory took its values (data sheet of the STM32F405, calibration values).
+const CALIBRATION_VDDA_UV: i64 = 3_300_000;
+const FULL_SCALE: i64 = 4_096;
+
+/// What the converter knows; `None` where it did not answer or has no reference yet.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Readings {
+    /// Supply of the Hall sensors.
+    pub supply: Option<Microvolts>,
+    /// Output of the open-sensor network.
+    pub network: Option<Microvolts>,
+    /// Die temperature of the MCU.
+    pub temperature: Option<MilliCelsius>,
+    /// The MCU's analogue supply.
+    pub vdda: Option<Microvolts>,
+}
+
+/// The converter.
+pub struct Analog {
+    adc: ADC1,
+    reference_next: bool,
+    vdda_uv: Option<i64>,
+    temperature: Option<MilliCelsius>,
+}
+
+impl Analog {
+    /// Takes the converter; its pins are analogue already.
+    pub fn new(adc: ADC1, common: &ADC_COMMON, rcc: &mut RCC) -> Self {
+        ADC1::enable(rcc);
+        ADC1::reset(rcc);
+        common.ccr().write(|w| {
+            // APB2 / 4 = 21 MHz, below the 36 MHz that the converter takes.
+            w.adcpre().div4();
+            w.tsvrefe().set_bit()
+        });
+        // The internal channels want 10 µs; the pins have dividers and networks of some kiloohms behind them.
+        adc.smpr1().write(|w| {
+            w.smp10().cycles84();
+            w.smp11().cycles84();
+            w.smp16().cycles480();
+            w.smp17().cycles480()
+        });
+        adc.cr2().write(|w| w.adon().set_bit());
+        Self {
+            adc,
+            reference_next: true,
+            vdda_uv: None,
+            temperature: None,
+        }
+    }
+
+    fn convert(&mut self, channel: u8) -> Option<i64> {
+        self.adc.sr().write(|w| w.eoc().clear_bit());
+        // SAFETY: a channel number of 0 … 18, of the constants above.
+        self.adc.sqr3().write(|w| unsafe { w.sq1().bits(channel) });
+        self.adc.cr2().modify(|_, w| w.swstart().set_bit());
+        time::wait_until(CONVERSION_LIMIT_US, || {
+            self.adc.sr().read().eoc().bit_is_set()
+        })
+        .then(|| i64::from(self.adc.dr().read().data().bits()))
+    }
+
+    fn microvolts(&self, code: i64, divider: i64) -> Option<Microvolts> {
+        let vdda = self.vdda_uv?;
+        Some(Microvolts(clamp_i32(div_round(
+            code.saturating_mul(vdda).saturating_mul(divider),
+            FULL_SCALE,
+        ))))
+    }
+
+    /// RM0090, temperature sensor, with the factory's two points.
+    fn die_temperature(&self, code: i64) -> Option<MilliCelsius> {
+        let at_30 = i64::from(VtempCal30::get().read());
+        let at_110 = i64::from(VtempCal110::get().read());
+        let span = at_110 - at_30;
+        if span <= 0 {
+            return None; // Never calibrated.
+        }
+        let at_calibration_supply = div_round(
+            code.saturating_mul(self.vdda_uv?),
+            CALIBRATION_VDDA_UV / 1_000,
+        );
+        let above_30 = at_calibration_supply - at_30 * 1_000;
+        Some(MilliCelsius(clamp_i32(
+            30_000 + div_round(above_30 * 80, span),
+        )))
+    }
+
+    /// Converts both pins and, in turn, one of the internal channels.
+    pub fn read(&mut self) -> Readings {
+        if self.reference_next {
+            let calibration = i64::from(VrefCal::get().read());
+            self.vdda_uv = self
+                .convert(REFERENCE)
+                .filter(|code| *code > 0 && (1..FULL_SCALE).contains(&calibration))
+                .map(|code| div_round(CALIBRATION_VDDA_UV * calibration, code));
+        } else {
+            self.temperature = self
+                .convert(TEMPERATURE)
+                .and_then(|code| self.die_temperature(code));
+        }
+        self.reference_next = !self.reference_next;
+        let supply = self.convert(SUPPLY);
+        let network = self.convert(NETWORK);
+        Readings {
+            supply: supply.and_then(|code| self.microvolts(code, SUPPLY_DIVIDER)),
+            network: network.and_then(|code| self.microvolts(code, 1)),
+            temperature: self.temperature,
+            vdda: self.vdda_uv.map(|uv| Microvolts(clamp_i32(uv))),
+        }
+    }
+}

@@ -1,0 +1,213 @@
+//! W25Q32 on SPI2 as an asynchronous NOR flash. A page program takes up to 3 ms and a sector erase up to 400 ms; the
+//! chip is asked once a millisecond meanwhile, so neither blocks anybody.
+
+use core::{future::poll_fn, task::Poll};
+
+use embedded_hal::spi::{Operation, SpiDevice};
+use embedded_storage_async::nor_flash::{
+    ErrorType, MultiwriteNorFlash, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
+};
+use rtic_monotonics::systick::prelude::*;
+
+use core_logic::check_in::Task;
+
+use crate::{Mono, app};
+
+/// 32 Mbit.
+pub const CAPACITY: usize = 4 * 1024 * 1024;
+/// The smallest unit that can be erased.
+pub const SECTOR: usize = 4 * 1024;
+const PAGE: u32 = 256;
+
+const READ_IDENTITY: u8 = 0x9F;
+const READ_STATUS: u8 = 0x05;
+const WRITE_ENABLE: u8 = 0x06;
+const READ: u8 = 0x03;
+const PAGE_PROGRAM: u8 = 0x02;
+const SECTOR_ERASE: u8 = 0x20;
+const RELEASE_POWER_DOWN: u8 = 0xAB;
+
+const STATUS_BUSY: u8 = 1 << 0;
+const STATUS_WRITE_ENABLED: u8 = 1 << 1;
+/// Winbond, SPI NOR, 2²² bytes. The later W25Q32JV-M answers 0x70 as its type.
+const MANUFACTURER: u8 = 0xEF;
+const SIZE: u8 = 0x16;
+
+/// Twice the data sheet's longest page program (3 ms) and sector erase (400 ms).
+const PROGRAM_LIMIT_MS: u32 = 6;
+const ERASE_LIMIT_MS: u32 = 800;
+
+/// What can go wrong.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, defmt::Format)]
+pub enum Error<E> {
+    /// The bus.
+    Bus(E),
+    /// Another chip, or none: the identity read.
+    Identity([u8; 3]),
+    /// Still busy after the longest time.
+    Timeout,
+    /// A write was not enabled: the chip is protected or not there.
+    NotEnabled,
+    /// Beyond the chip's end.
+    OutOfBounds,
+    /// Not a sector's beginning.
+    NotAligned,
+}
+
+impl<E: core::fmt::Debug> NorFlashError for Error<E> {
+    fn kind(&self) -> NorFlashErrorKind {
+        match self {
+            Self::OutOfBounds => NorFlashErrorKind::OutOfBounds,
+            Self::NotAligned => NorFlashErrorKind::NotAligned,
+            _ => NorFlashErrorKind::Other,
+        }
+    }
+}
+
+/// The chip.
+pub struct Flash<SPI>(SPI);
+
+/// A command and its 24-bit address.
+fn command(code: u8, address: u32) -> [u8; 4] {
+    let [_, high, middle, low] = address.to_be_bytes();
+    [code, high, middle, low]
+}
+
+/// Lets the other tasks and interrupts of the same priority run.
+pub async fn yield_now() {
+    let mut yielded = false;
+    poll_fn(|context| {
+        if yielded {
+            return Poll::Ready(());
+        }
+        yielded = true;
+        context.waker().wake_by_ref();
+        Poll::Pending
+    })
+    .await;
+}
+
+impl<SPI: SpiDevice> Flash<SPI> {
+    /// Takes the chip without a transfer.
+    pub fn new(spi: SPI) -> Self {
+        Self(spi)
+    }
+
+    /// Wakes the chip and makes sure that it is the one expected.
+    pub async fn start(&mut self) -> Result<(), Error<SPI::Error>> {
+        self.0.write(&[RELEASE_POWER_DOWN]).map_err(Error::Bus)?;
+        // 3 µs until it listens; and an erase that a reset of the MCU cut off from us may still run.
+        Mono::delay(1.millis()).await;
+        self.wait(ERASE_LIMIT_MS).await?;
+        let mut identity = [0; 3];
+        self.transfer(&[READ_IDENTITY], &mut identity)?;
+        match identity {
+            [MANUFACTURER, _, SIZE] => Ok(()),
+            other => Err(Error::Identity(other)),
+        }
+    }
+
+    fn transfer(&mut self, command: &[u8], answer: &mut [u8]) -> Result<(), Error<SPI::Error>> {
+        self.0
+            .transaction(&mut [Operation::Write(command), Operation::Read(answer)])
+            .map_err(Error::Bus)
+    }
+
+    fn status(&mut self) -> Result<u8, Error<SPI::Error>> {
+        let mut status = [0];
+        self.transfer(&[READ_STATUS], &mut status)?;
+        let [status] = status;
+        Ok(status)
+    }
+
+    async fn wait(&mut self, limit_ms: u32) -> Result<(), Error<SPI::Error>> {
+        for _ in 0..limit_ms {
+            if self.status()? & STATUS_BUSY == 0 {
+                return Ok(());
+            }
+            app::alive(Task::Storage);
+            Mono::delay(1.millis()).await;
+        }
+        Err(Error::Timeout)
+    }
+
+    fn enable_write(&mut self) -> Result<(), Error<SPI::Error>> {
+        self.0.write(&[WRITE_ENABLE]).map_err(Error::Bus)?;
+        if self.status()? & STATUS_WRITE_ENABLED == 0 {
+            return Err(Error::NotEnabled);
+        }
+        Ok(())
+    }
+}
+
+fn within(offset: u32, length: usize) -> Option<u32> {
+    let end = usize::try_from(offset).ok()?.checked_add(length)?;
+    (end <= CAPACITY).then_some(offset)
+}
+
+impl<SPI: SpiDevice> ErrorType for Flash<SPI> {
+    type Error = Error<SPI::Error>;
+}
+
+impl<SPI: SpiDevice> ReadNorFlash for Flash<SPI> {
+    const READ_SIZE: usize = 1;
+
+    async fn read(&mut self, offset: u32, bytes: &mut [u8]) -> Result<(), Self::Error> {
+        let offset = within(offset, bytes.len()).ok_or(Error::OutOfBounds)?;
+        self.transfer(&command(READ, offset), bytes)?;
+        yield_now().await;
+        Ok(())
+    }
+
+    fn capacity(&self) -> usize {
+        CAPACITY
+    }
+}
+
+impl<SPI: SpiDevice> NorFlash for Flash<SPI> {
+    const WRITE_SIZE: usize = 1;
+    const ERASE_SIZE: usize = SECTOR;
+
+    async fn erase(&mut self, from: u32, to: u32) -> Result<(), Self::Error> {
+        let length = to.checked_sub(from).ok_or(Error::NotAligned)?;
+        within(from, usize::try_from(length).unwrap_or(usize::MAX)).ok_or(Error::OutOfBounds)?;
+        let sector = u32::try_from(SECTOR).unwrap_or(u32::MAX);
+        if !from.is_multiple_of(sector) || !to.is_multiple_of(sector) {
+            return Err(Error::NotAligned);
+        }
+        let mut at = from;
+        while at < to {
+            self.enable_write()?;
+            self.0
+                .write(&command(SECTOR_ERASE, at))
+                .map_err(Error::Bus)?;
+            self.wait(ERASE_LIMIT_MS).await?;
+            at += sector;
+        }
+        Ok(())
+    }
+
+    async fn write(&mut self, offset: u32, bytes: &[u8]) -> Result<(), Self::Error> {
+        let mut at = within(offset, bytes.len()).ok_or(Error::OutOfBounds)?;
+        let mut left = bytes;
+        while !left.is_empty() {
+            // A program wraps within its page.
+            let room = usize::try_from(PAGE - at % PAGE).unwrap_or(1);
+            let (now, later) = left.split_at(room.min(left.len()));
+            self.enable_write()?;
+            self.0
+                .transaction(&mut [
+                    Operation::Write(&command(PAGE_PROGRAM, at)),
+                    Operation::Write(now),
+                ])
+                .map_err(Error::Bus)?;
+            self.wait(PROGRAM_LIMIT_MS).await?;
+            at = at.saturating_add(u32::try_from(now.len()).unwrap_or(0));
+            left = later;
+        }
+        Ok(())
+    }
+}
+
+/// NOR flash clears bits: the same byte may be written again with more zeros.
+impl<SPI: SpiDevice> MultiwriteNorFlash for Flash<SPI> {}

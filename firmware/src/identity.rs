@@ -1,0 +1,145 @@
+//! Who the board is and why it started, for CAN and RS485.
+
+use core_logic::{
+    can::{Identity, ResetCause as CanCause},
+    design_parameters::LARGE_FULL_SCALE,
+    diagnosis::Code,
+    modbus::Readings,
+    retained::SavePolicyConfig,
+    units::{Duration, Nanocoulombs, clamp_i64},
+};
+use stm32f4xx_hal::signature::Uid;
+
+use crate::retain::{Previous, ResetCause};
+
+/// From the last write of the retained slots to the first reading of the meter after a reset: 100 ms between writes,
+/// 450 ms for the flash, 30 ms for the start.
+const RESTART: Duration = Duration::from_ticks(600_000);
+/// A watchdog's reset has its longest period before it: 1.9 s at the slowest oscillator.
+const WATCHDOG_PERIOD: Duration = Duration::from_ticks(1_900_000);
+/// From the decision to save to the end of the write, with an erase of 400 ms in between and a turn of 100 ms.
+const SAVE_LATENCY: Duration = Duration::from_ticks(1_000_000);
+
+/// The identity frames' content.
+pub fn identity(previous: &Previous) -> Identity {
+    Identity {
+        version: [
+            number(env!("CARGO_PKG_VERSION_MAJOR")),
+            number(env!("CARGO_PKG_VERSION_MINOR")),
+            number(env!("CARGO_PKG_VERSION_PATCH")),
+        ],
+        reset_cause: can_cause(previous.cause),
+        boots: previous.resets,
+        commit: hexadecimal(env!("HALLMARK_COMMIT")),
+        modified: !env!("HALLMARK_MODIFIED").is_empty(),
+        configuration_crc: 0,
+        panic_hash: previous.fault_hash(),
+        panic_line: previous.panic_line(),
+        late_tasks: previous.late_tasks,
+        unique_id: unique_id(),
+        uptime: Duration::from_ticks(0),
+        stack_free: 0,
+        log_fill: None,
+    }
+}
+
+/// The conditions that hold from the start on because of how the last run ended.
+pub fn lasting(previous: &Previous) -> impl Iterator<Item = Code> {
+    let bits = previous.cause.bits();
+    let rows = [
+        (
+            Code::WatchdogReset,
+            bits & (ResetCause::WATCHDOG | ResetCause::WINDOW_WATCHDOG) != 0,
+        ),
+        (Code::PanicReset, previous.fault.is_some()),
+        (
+            Code::BrownOutReset,
+            bits & ResetCause::BROWN_OUT != 0 && bits & ResetCause::POWER_ON == 0,
+        ),
+    ];
+    rows.into_iter()
+        .filter(|(_, present)| *present)
+        .map(|(code, _)| code)
+}
+
+/// Fills in what a client reads of it.
+pub fn fill(identity: &Identity, readings: &mut Readings) {
+    readings.firmware_version = identity.version.map(u16::from);
+    readings.revision = identity.commit;
+    readings.unique_id = identity.unique_id;
+    readings.reset_cause = modbus_cause(identity.reset_cause);
+    readings.resets = identity.boots;
+    readings.panic_hash = identity.panic_hash;
+}
+
+/// Charge that the largest current moves while nobody counts over a reset.
+pub fn loss_over_reset(previous: &Previous) -> Nanocoulombs {
+    let by_watchdog = previous.cause.bits() & ResetCause::WATCHDOG != 0;
+    let time = if by_watchdog {
+        RESTART.saturating_add(WATCHDOG_PERIOD)
+    } else {
+        RESTART
+    };
+    // µA · µs / 1000 = nC
+    let charge = i128::from(LARGE_FULL_SCALE.get()) * i128::from(time.as_ticks()) / 1_000;
+    Nanocoulombs(clamp_i64(charge))
+}
+
+/// Charge that can have moved since the last record in flash.
+pub fn loss_over_power_off() -> Nanocoulombs {
+    SavePolicyConfig::default().loss_bound(LARGE_FULL_SCALE, SAVE_LATENCY)
+}
+
+/// The most telling of the causes.
+fn can_cause(cause: ResetCause) -> CanCause {
+    let bits = cause.bits();
+    let order = [
+        (ResetCause::POWER_ON, CanCause::PowerOn),
+        (ResetCause::BROWN_OUT, CanCause::BrownOut),
+        (ResetCause::WATCHDOG, CanCause::IndependentWatchdog),
+        (ResetCause::WINDOW_WATCHDOG, CanCause::WindowWatchdog),
+        (ResetCause::SOFTWARE, CanCause::Software),
+        (ResetCause::LOW_POWER, CanCause::LowPower),
+        (ResetCause::PIN, CanCause::Pin),
+    ];
+    order
+        .into_iter()
+        .find(|(bit, _)| bits & bit != 0)
+        .map_or(CanCause::Unknown, |(_, cause)| cause)
+}
+
+fn modbus_cause(cause: CanCause) -> u16 {
+    match cause {
+        CanCause::Unknown => 0,
+        CanCause::PowerOn => ResetCause::POWER_ON,
+        CanCause::BrownOut => ResetCause::BROWN_OUT,
+        CanCause::Pin => ResetCause::PIN,
+        CanCause::Software => ResetCause::SOFTWARE,
+        CanCause::IndependentWatchdog => ResetCause::WATCHDOG,
+        CanCause::WindowWatchdog => ResetCause::WINDOW_WATCHDOG,
+        CanCause::LowPower => ResetCause::LOW_POWER,
+    }
+}
+
+fn unique_id() -> [u32; 3] {
+    let uid = Uid::get();
+    let mut lot = [0; 8];
+    for (to, from) in lot.iter_mut().zip(uid.lot_num().bytes()) {
+        *to = from;
+    }
+    let [a, b, c, d, e, f, g, _] = lot;
+    [
+        u32::from(uid.x()) | u32::from(uid.y()) << 16,
+        u32::from_le_bytes([uid.waf_num(), a, b, c]),
+        u32::from_le_bytes([d, e, f, g]),
+    ]
+}
+
+/// A number of the package's version.
+fn number(text: &str) -> u8 {
+    text.parse().unwrap_or(0)
+}
+
+fn hexadecimal(text: &str) -> u32 {
+    u32::from_str_radix(text, 16).unwrap_or(0)
+}

@@ -1,0 +1,963 @@
+//! The image of the Hallmark board: an RTIC app for the STM32F405RG. Tasks and their wiring; docs/firmware.md has the
+//! tables of pins, tasks and peripherals.
+#![no_std]
+#![no_main]
+#![expect(
+    unused_lifetimes,
+    reason = "of what RTIC's macro makes of an async task"
+)]
+
+use defmt_rtt as _;
+use panic_probe as _;
+use rtic_monotonics::systick::prelude::*;
+
+mod analog;
+mod board;
+mod can_bus;
+mod center;
+mod converter;
+mod fault;
+mod flash;
+mod i2c;
+mod identity;
+mod inputs;
+mod meter;
+mod retain;
+mod rs485;
+mod spi;
+mod stack;
+mod storage;
+mod time;
+mod watchdog;
+
+systick_monotonic!(Mono, 1_000);
+
+defmt::timestamp!("{=u64:us}", time::now().as_ticks());
+
+#[rtic::app(
+    device = stm32f4xx_hal::pac,
+    peripherals = true,
+    // Interrupts of peripherals that this board does not use; one per priority of software tasks.
+    dispatchers = [UART4, UART5, USART6]
+)]
+mod app {
+    use core::sync::atomic::{AtomicU32, Ordering};
+
+    use core_logic::{
+        check_in::{CheckIn, Task},
+        configuration::{Configuration, ConfigurationStore},
+        converter::ConverterSample,
+        diagnosis::Code,
+        front_end::Channel,
+        measurement::{ConverterFault, Order},
+        meter::{GapBridge, MeterChannel, MeterReport},
+        modbus::{Command, CommandState, Event, Readings},
+        modbus_rtu::Server,
+        retained::{RetainSlots, RetainedState, SavePolicy, Slot},
+        storm::StormConfig,
+        units::{Duration, Instant, Nanocoulombs, elapsed},
+    };
+    use heapless::spsc;
+    use rtic::Mutex as _;
+    use rtic_monotonics::systick::prelude::*;
+    use rtic_sync::signal::Signal;
+
+    use crate::{
+        Mono,
+        analog::Analog,
+        board::{self, Board, Edges, MeterLine},
+        center::{Center, MeterLink},
+        converter::{Converter, Progress},
+        identity,
+        inputs::Lines,
+        meter::{self, Meter, event},
+        retain::{self, Previous, Stage},
+        rs485::{Character, Port, QUEUE_LENGTH},
+        stack,
+        storage::{Storage, Stored},
+        time,
+        watchdog::Watchdog,
+    };
+
+    /// What the meter's task is asked to do.
+    static METER_EVENTS: AtomicU32 = AtomicU32::new(0);
+    static METER_WAKE: Signal<()> = Signal::new();
+    /// Characters or a pause on RS485.
+    static RS485_WAKE: Signal<()> = Signal::new();
+    /// The tasks that have shown life since idle last looked, as bits of `Task`.
+    static ALIVE: AtomicU32 = AtomicU32::new(0);
+
+    /// `task` is alive.
+    pub fn alive(task: Task) {
+        ALIVE.fetch_or(1 << task as u32, Ordering::Relaxed);
+    }
+
+    fn ask_meter(events: u32) {
+        METER_EVENTS.fetch_or(events, Ordering::AcqRel);
+        METER_WAKE.writer().write(());
+    }
+
+    /// The flash has so long to deliver its content before the board starts without it: an erase that a reset left
+    /// running takes 400 ms, and the watchdog bites after 680 ms at the earliest.
+    const LOAD_LIMIT_MS: u32 = 450;
+    /// Every task has to check in from here on, started or not.
+    const START_LIMIT: Duration = Duration::from_ticks(1_000_000);
+    const METER_POLL_MS: u32 = 20;
+    /// Ten seconds: a conversion adds a little noise to the energy.
+    const TEMPERATURE_EVERY_POLLS: u32 = 500;
+    /// The result is fetched this long before the next conversion, when even a slow one has ended.
+    const TEMPERATURE_AFTER_POLLS: u32 = 400;
+    const TICK_MS: u32 = 10;
+    /// Time between two log records when nothing happens.
+    const LOG_PERIOD_MS: u32 = 10_000;
+    /// Stack that has to stay free.
+    const STACK_RESERVE: usize = 8 * 1024;
+
+    /// Orders to the storage task.
+    #[derive(Clone, Copy, Default)]
+    pub struct Requests {
+        save: bool,
+        restore: bool,
+        clear_log: bool,
+    }
+
+    /// What the two tasks of priority 1 share.
+    pub struct Administration {
+        store: ConfigurationStore,
+        requests: Requests,
+        busy: bool,
+        /// Generation of the configuration that the flash holds.
+        saved: Option<u32>,
+        flash_counters: [u32; 5],
+    }
+
+    #[shared]
+    struct Shared {
+        edges: Edges,
+        meter_line: MeterLine,
+        meter_link: MeterLink,
+        port: Port,
+        center: Center,
+        administration: Administration,
+        line_storm: StormConfig,
+    }
+
+    #[local]
+    struct Local {
+        watchdog: Watchdog,
+        characters_in: spsc::Producer<'static, Character>,
+        characters_out: spsc::Consumer<'static, Character>,
+        meter: Meter,
+        converter: Converter,
+        analog: Analog,
+        lines: Lines,
+        storage: Storage,
+        previous: Previous,
+    }
+
+    #[init(local = [characters: spsc::Queue<Character, QUEUE_LENGTH> = spsc::Queue::new()])]
+    fn init(mut cx: init::Context) -> (Shared, Local) {
+        let store = ConfigurationStore::default();
+        let configuration = *store.active();
+        let board = Board::start(cx.device, &configuration);
+        Mono::start(cx.core.SYST, board::CORE_HZ);
+        // SAFETY: the exception is not enabled for anybody yet. Below the range edge: the timer queue's work must not
+        // delay a time stamp. 4 of RTIC's priorities are the top 4 of the 16.
+        unsafe {
+            cx.core.SCB.set_priority(
+                cortex_m::peripheral::scb::SystemHandler::SysTick,
+                board::SYSTICK_PRIORITY,
+            );
+        }
+
+        let now = time::now();
+        let previous = board.previous;
+        let identity = identity::identity(&previous);
+        let mut center = Center::new(configuration, board.can, identity, now);
+        for code in identity::lasting(&previous) {
+            center.conditions.happened.set(code, true);
+        }
+        report(&previous);
+        let meter_config = center.measurement.meter_config(&configuration);
+        let channel = MeterChannel::new(meter_config);
+        let (characters_in, characters_out) = cx.local.characters.split();
+
+        let shared = Shared {
+            edges: board.edges,
+            meter_line: board.meter_line,
+            meter_link: MeterLink {
+                report: MeterReport::default(),
+                health: meter::Health::default(),
+                in_self_test: false,
+                temperature: None,
+                storms: 0,
+                latency_us: 0,
+                bridge: GapBridge::Unknown,
+                config: meter_config,
+            },
+            port: board.rs485,
+            center,
+            administration: Administration {
+                store,
+                requests: Requests::default(),
+                busy: false,
+                saved: None,
+                flash_counters: [0; 5],
+            },
+            line_storm: configuration.meter_line_storm,
+        };
+        let local = Local {
+            watchdog: board.watchdog,
+            characters_in,
+            characters_out,
+            converter: Converter::new(board.i2c, &configuration.converter),
+            meter: Meter::new(board.meter_spi, channel),
+            analog: board.analog,
+            lines: board.lines,
+            storage: Storage::new(board.flash_spi),
+            previous,
+        };
+        // The queues are empty: both take one.
+        let _ = storage::spawn();
+        let _ = rs485::spawn();
+        retain::note_stage(Stage::Running);
+        (shared, local)
+    }
+
+    fn report(previous: &Previous) {
+        defmt::info!(
+            "start {}: {}, stage {}, late tasks {=u8:08b}",
+            previous.resets,
+            previous.cause.describe(),
+            previous.stage,
+            previous.late_tasks
+        );
+        if let Some(fault) = previous.fault {
+            defmt::error!(
+                "last run ended with {}: {=str}",
+                fault,
+                previous.panic_text()
+            );
+        }
+    }
+
+    /// Feeds the watchdog when every task has checked in, and sleeps.
+    #[idle(local = [watchdog])]
+    fn idle(cx: idle::Context) -> ! {
+        let mut check_in = CheckIn::default();
+        let mut noted = 0;
+        let mut all = false;
+        let start = time::now();
+        for task in [Task::Storage, Task::Rs485] {
+            check_in.enable(task, start);
+        }
+        loop {
+            let now = time::now();
+            if !all && elapsed(start, now) >= START_LIMIT {
+                all = true;
+                for task in Task::ALL {
+                    check_in.enable(task, now);
+                }
+            }
+            let seen = ALIVE.swap(0, Ordering::Relaxed);
+            for task in Task::ALL {
+                if seen & (1 << task as u32) != 0 {
+                    check_in.check_in(task, now);
+                }
+            }
+            let late = match check_in.may_feed(now) {
+                Ok(()) => {
+                    cx.local.watchdog.feed();
+                    0
+                }
+                Err(late) => late.bits(),
+            };
+            if late != noted {
+                noted = late;
+                retain::note_late_tasks(late);
+                if late != 0 {
+                    defmt::warn!("late tasks {=u8:08b}", late);
+                }
+            }
+            cortex_m::asm::wfi();
+        }
+    }
+
+    /// Range-flag edge. Deadline 5 µs: a miss makes the edge's time stamp late by as much.
+    #[task(binds = EXTI0, priority = 4, shared = [edges])]
+    fn range_edge(mut cx: range_edge::Context) {
+        let now = time::now();
+        cx.shared.edges.lock(|edges| edges.on_interrupt(now));
+        ask_meter(event::EDGE);
+    }
+
+    /// IRQ of the meter. Deadline 20 ms, the next poll: it only backs the poll up.
+    #[task(binds = EXTI4, priority = 3, shared = [edges, meter_line, line_storm])]
+    fn meter_interrupt(cx: meter_interrupt::Context) {
+        let now = time::now();
+        (cx.shared.edges, cx.shared.meter_line, cx.shared.line_storm)
+            .lock(|edges, line, storm| line.on_interrupt(edges, storm, now));
+        ask_meter(event::IRQ);
+    }
+
+    /// The meter's owner. Deadline 100 µs from a range edge to the latching of AENERGY: a miss lets counts of the new
+    /// range carry the old range's scale, 48 mC per 100 µs from 600 to 60 A, corrected by the known delay. The poll's
+    /// deadline is 20 ms; nothing is lost before the accumulator is half full, 469 s.
+    #[task(priority = 3, local = [meter], shared = [edges, meter_line, meter_link, line_storm])]
+    async fn meter_owner(mut cx: meter_owner::Context, charge: Option<Nanocoulombs>) {
+        let meter = cx.local.meter;
+        let Some(mut wake) = METER_WAKE.try_take_reader() else {
+            return;
+        };
+        if let Some(charge) = charge {
+            meter
+                .channel()
+                .restore(charge, Nanocoulombs::ZERO, Nanocoulombs::ZERO);
+        }
+        if meter.is_fresh() {
+            cx.shared.meter_link.lock(|link| link.in_self_test = true);
+            if let Some(test) = meter.start_self_test() {
+                for _ in 0..meter::SELF_TEST_MS / 10 {
+                    Mono::delay(10.millis()).await;
+                    alive(Task::Meter);
+                }
+                meter.finish_self_test(test);
+            }
+        }
+        cx.shared.meter_link.lock(|link| link.in_self_test = false);
+        let mut next_poll = Mono::now();
+        let mut polls = 0_u32;
+        let mut next_temperature = 0;
+        let (mut edge, mut interrupt, mut verify, mut poll) = (false, false, true, true);
+        let (mut convert, mut fetch) = (false, false);
+        let mut edge_at = None;
+        loop {
+            let now = time::now();
+            let events = METER_EVENTS.swap(0, Ordering::AcqRel);
+            if events & event::EDGE != 0 {
+                edge = true;
+                edge_at = edge_at.or(cx.shared.edges.lock(|edges| edges.history(now).last_edge));
+            }
+            interrupt |= events & event::IRQ != 0;
+            let (bridge, config) = cx.shared.meter_link.lock(|link| (link.bridge, link.config));
+            if *meter.channel().config() != config {
+                meter.channel().set_config(config);
+            }
+            // Without a counting chip there is nothing to hand over.
+            edge &= meter.is_counting();
+            edge_at = edge_at.filter(|_| edge);
+            let mut worked = true;
+            if edge && meter.may_snapshot(now) {
+                edge = false;
+                meter.snapshot(|at| cx.shared.edges.lock(|edges| edges.history(at)), bridge);
+                publish(meter, &mut cx.shared.meter_link, edge_at.take());
+            } else if verify {
+                verify = false;
+                let mode_is_right = meter.verify(now);
+                // Only right after MODE was seen to be right: the write would hide that a reset has cleared it.
+                convert = mode_is_right && polls >= next_temperature;
+            } else if convert {
+                convert = false;
+                next_temperature = polls.saturating_add(TEMPERATURE_EVERY_POLLS);
+                meter.start_temperature();
+            } else if fetch && !poll {
+                fetch = false;
+                let temperature = meter.temperature();
+                cx.shared
+                    .meter_link
+                    .lock(|link| link.temperature = temperature);
+            } else if poll {
+                poll = false;
+                polls = polls.saturating_add(1);
+                fetch = polls.saturating_add(TEMPERATURE_AFTER_POLLS) == next_temperature;
+                if meter.is_counting() {
+                    meter.snapshot(|at| cx.shared.edges.lock(|edges| edges.history(at)), bridge);
+                }
+                publish(meter, &mut cx.shared.meter_link, None);
+                alive(Task::Meter);
+            } else if interrupt {
+                cx.shared.meter_line.lock(|line| line.clear_pending());
+                let status = meter.take_status();
+                defmt::debug!("meter: {}", status);
+                interrupt = (
+                    &mut cx.shared.edges,
+                    &mut cx.shared.meter_line,
+                    &mut cx.shared.line_storm,
+                )
+                    .lock(|edges, line, storm| line.still_low(edges, storm, now));
+            } else {
+                worked = false;
+            }
+            if worked {
+                // The other interrupts of this priority have their turn between two steps.
+                crate::flash::yield_now().await;
+                continue;
+            }
+
+            let masked = cx.shared.edges.lock(|edges| edges.is_masked());
+            let until = if edge || masked {
+                Mono::now() + 1.millis()
+            } else {
+                next_poll
+            };
+            // A time-out is one of the two expected outcomes.
+            let _ = Mono::timeout_at(until, wake.wait()).await;
+            let now = time::now();
+            let (found, irq, storms) = (
+                &mut cx.shared.edges,
+                &mut cx.shared.meter_line,
+                &mut cx.shared.line_storm,
+            )
+                .lock(|edges, line, storm| {
+                    let found = edges.poll(now);
+                    let irq = line.poll(edges, storm, now);
+                    (found, irq, edges.storms().saturating_add(line.storms()))
+                });
+            cx.shared.meter_link.lock(|link| link.storms = storms);
+            edge |= found;
+            interrupt |= irq;
+            if Mono::now() >= next_poll {
+                (verify, poll) = (true, true);
+                next_poll += METER_POLL_MS.millis();
+                if Mono::now() >= next_poll {
+                    next_poll = Mono::now() + METER_POLL_MS.millis();
+                }
+            }
+        }
+    }
+
+    /// Hands the meter's state to the measurement, with the age of the edge that asked for it.
+    fn publish(meter: &Meter, link: &mut impl rtic::Mutex<T = MeterLink>, asked: Option<Instant>) {
+        let (report, health) = (meter.report(), meter.health());
+        let latency = asked
+            .zip(report.at)
+            .map_or(0, |(asked, at)| elapsed(asked, at).as_ticks());
+        link.lock(|link| {
+            link.report = report;
+            link.health = health;
+            link.latency_us = link
+                .latency_us
+                .max(u32::try_from(latency).unwrap_or(u32::MAX));
+        });
+    }
+
+    /// The converter's owner. Deadline one conversion, 31 ms: a miss costs a sample of the average; stale after three.
+    #[task(priority = 2, local = [converter], shared = [center, edges])]
+    async fn conversion(mut cx: conversion::Context) {
+        let converter = cx.local.converter;
+        loop {
+            alive(Task::Conversion);
+            let (channel, config) = cx.shared.center.lock(|center| {
+                (
+                    center.configuration.front_end.channel(),
+                    center.configuration.converter,
+                )
+            });
+            if channel != Channel::Ads1100 {
+                Mono::delay(TICK_MS.millis()).await;
+                continue;
+            }
+            let started = time::now();
+            let outcome = match converter.start(&config) {
+                Ok(()) => finish(converter, &config).await,
+                Err(fault) => Err(fault),
+            };
+            let finished = time::now();
+            let history = cx.shared.edges.lock(|edges| edges.history(finished));
+            let failed = outcome.is_err();
+            cx.shared.center.lock(|center| {
+                center.converter = converter.counters();
+                match outcome {
+                    Ok(Some(code)) => {
+                        let configuration = config.expected_configuration();
+                        center.on_conversion(
+                            &ConverterSample {
+                                started,
+                                finished,
+                                configuration,
+                                code,
+                            },
+                            &history,
+                        );
+                    }
+                    Ok(None) => {}
+                    Err(fault) => center.on_converter_fault(fault, finished),
+                }
+            });
+            if failed {
+                // A bus that fails at once must not take the time of those that work.
+                Mono::delay(TICK_MS.millis()).await;
+            }
+        }
+    }
+
+    /// Polls the conversion under way from 0.8 to 1.5 of its nominal time.
+    async fn finish(
+        converter: &mut Converter,
+        config: &core_logic::converter::ConverterConfig,
+    ) -> Result<Option<i16>, ConverterFault> {
+        let period_ms = u32::try_from(config.data_rate.period().as_millis()).unwrap_or(125);
+        Mono::delay((period_ms * 4 / 5).millis()).await;
+        for _ in 0..period_ms * 7 / 10 + 2 {
+            match converter.poll(config)? {
+                Progress::Busy => Mono::delay(1.millis()).await,
+                Progress::Discarded => return Ok(None),
+                Progress::Ready(sample) => return Ok(Some(sample.code)),
+            }
+        }
+        converter.on_timeout();
+        Err(ConverterFault::NoAnswer)
+    }
+
+    /// Environment, diagnosis, permit and CAN, every 10 ms with at most 0.5 ms of jitter. A miss: a late frame.
+    #[task(priority = 2, local = [analog, lines], shared = [center, edges, meter_link])]
+    async fn tick(mut cx: tick::Context) {
+        let mut next = Mono::now();
+        loop {
+            next += TICK_MS.millis();
+            Mono::delay_until(next).await;
+            alive(Task::Tick);
+            time::extend();
+            let now = time::now();
+            let history = cx.shared.edges.lock(|edges| edges.history(now));
+            let readings = cx.local.analog.read();
+            let levels = cx.local.lines.levels();
+            let mut link = cx.shared.meter_link.lock(|link| *link);
+            let permit = cx
+                .shared
+                .center
+                .lock(|center| center.tick(now, &history, levels, &readings, &mut link));
+            cx.shared.meter_link.lock(|shared| {
+                shared.bridge = link.bridge;
+                shared.config = link.config;
+            });
+            cx.local.lines.permit(permit);
+            alive(Task::Environment);
+        }
+    }
+
+    /// A mailbox has become free. Deadline: the next frame.
+    #[task(binds = CAN1_TX, priority = 2, shared = [center])]
+    fn can_transmitted(mut cx: can_transmitted::Context) {
+        cx.shared
+            .center
+            .lock(|center| center.bus.on_transmitted(time::now()));
+    }
+
+    /// A frame for this board. Deadline 0.7 ms, three frames of the shortest kind: a miss loses one, counted.
+    #[task(binds = CAN1_RX0, priority = 2, shared = [center])]
+    fn can_received(mut cx: can_received::Context) {
+        cx.shared
+            .center
+            .lock(|center| center.on_received(time::now()));
+    }
+
+    /// Bus-off.
+    #[task(binds = CAN1_SCE, priority = 2, shared = [center])]
+    fn can_error(mut cx: can_error::Context) {
+        cx.shared
+            .center
+            .lock(|center| center.bus.on_error(time::now()));
+    }
+
+    /// RS485 characters. Deadline 95 µs, one character: a miss spoils the request, which is counted.
+    #[task(binds = USART2, priority = 3, local = [characters_in], shared = [port])]
+    fn rs485_character(mut cx: rs485_character::Context) {
+        if cx
+            .shared
+            .port
+            .lock(|port| port.on_interrupt(cx.local.characters_in))
+        {
+            RS485_WAKE.writer().write(());
+        }
+    }
+
+    /// The Modbus server. No deadline but the client's patience.
+    #[task(priority = 1, local = [characters_out], shared = [port, center, administration, edges, meter_link, line_storm])]
+    async fn rs485(mut cx: rs485::Context) {
+        let Some(mut wake) = RS485_WAKE.try_take_reader() else {
+            return;
+        };
+        let mut server = Server::new(time::now());
+        let mut last_command = 0;
+        let mut errors = 0;
+        let mut generation = 0;
+        let mut checked = time::now();
+        loop {
+            alive(Task::Rs485);
+            let wait_ms = server
+                .ends_at()
+                .map_or(100, |end| until_ms(end, time::now()).clamp(1, 100));
+            let _ = Mono::timeout_after(wait_ms.millis(), wake.wait()).await;
+            while let Some(character) = cx.local.characters_out.dequeue() {
+                let (byte, line_errors, at) = character.unpack();
+                server.on_character(byte, line_errors, at);
+            }
+            let now = time::now();
+            if server.ends_at().is_some_and(|end| now >= end) {
+                let mut readings = readings(&mut cx, &server, last_command);
+                let served = cx.shared.administration.lock(|administration| {
+                    readings.configuration_generation = administration.store.generation();
+                    readings.configuration_crc = administration.store.crc();
+                    readings.configuration_saved =
+                        administration.saved == Some(administration.store.generation());
+                    readings.storage_busy = administration.busy;
+                    readings.flash_counters = administration.flash_counters;
+                    server.serve(now, &readings, &mut administration.store)
+                });
+                if let Some(served) = served {
+                    if let Some(Event::Command(command)) = served.event {
+                        last_command = u16::from(Command::KEY) << 8 | command as u16;
+                        carry_out(
+                            &mut cx.shared.center,
+                            &mut cx.shared.administration,
+                            command,
+                        );
+                    }
+                    if let Some((reply, earliest)) = served.reply {
+                        Mono::delay(until_ms(earliest, time::now()).millis()).await;
+                        cx.shared.port.lock(|port| port.send(reply));
+                    }
+                }
+            }
+
+            let total = server.counters().communication_errors;
+            if total != errors {
+                errors = total;
+                cx.shared
+                    .center
+                    .lock(|center| center.conditions.rs485_errors = true);
+            }
+            let found = cx.shared.center.lock(|center| center.found.take());
+            let corrupt = elapsed(checked, now) >= Duration::from_ticks(1_000_000);
+            if corrupt {
+                checked = now;
+            }
+            let (active, changed, damaged) = cx.shared.administration.lock(|administration| {
+                let store = &mut administration.store;
+                let damaged = corrupt && store.verify().is_err();
+                if let Some(found) = found
+                    && let Ok(active) = store.stage()
+                {
+                    let mut staged = *active;
+                    found.store(&mut staged);
+                    if store.commit(staged).is_err() {
+                        defmt::warn!("calibration not taken: {}", found);
+                    }
+                }
+                let changed = store.generation() != generation;
+                generation = store.generation();
+                (*store.active(), changed, damaged)
+            });
+            if changed {
+                apply(&mut cx, &active);
+            }
+            if damaged {
+                cx.shared.center.lock(|center| {
+                    center
+                        .conditions
+                        .happened
+                        .set(Code::ConfigurationCorruptRam, true);
+                });
+            }
+        }
+    }
+
+    /// Whole milliseconds until `at`, rounded up; 0 when it has passed.
+    fn until_ms(at: Instant, now: Instant) -> u32 {
+        u32::try_from(elapsed(now, at).as_ticks().div_ceil(1_000)).unwrap_or(u32::MAX)
+    }
+
+    /// Hands another active configuration to the owners of its parts.
+    fn apply(cx: &mut rs485::Context<'_>, active: &Configuration) {
+        cx.shared.center.lock(|center| {
+            center.set_configuration(active);
+            center.identity.configuration_crc = active.crc();
+        });
+        cx.shared
+            .edges
+            .lock(|edges| edges.set_config(active.edge_storm));
+        cx.shared
+            .line_storm
+            .lock(|storm| *storm = active.meter_line_storm);
+    }
+
+    /// A snapshot of everything that a client can read.
+    fn readings(cx: &mut rs485::Context<'_>, server: &Server, last_command: u16) -> Readings {
+        let now = time::now();
+        let mut readings = Readings {
+            last_command,
+            ..Readings::default()
+        };
+        let link = cx.shared.meter_link.lock(|link| *link);
+        cx.shared.center.lock(|center| {
+            center.fill(&mut readings);
+            identity::fill(&center.identity, &mut readings);
+            let free = usize::try_from(center.identity.stack_free).unwrap_or(0);
+            readings.stack_high_water =
+                u32::try_from(stack::BYTES.saturating_sub(free)).unwrap_or(u32::MAX);
+        });
+        readings.uptime_s = u32::try_from(now.as_ticks() / 1_000_000).unwrap_or(u32::MAX);
+        readings.snapshot_latency_us = link.latency_us;
+        let health = link.health;
+        readings.meter_counters = [
+            health.repeated,
+            health.checksum_failures,
+            health.resets,
+            link.report.rejected,
+            health.read_back_failures,
+        ];
+        let counters = server.counters();
+        readings.rs485_counters = [
+            counters.messages,
+            counters.communication_errors,
+            counters.exceptions,
+            counters.server_messages,
+            counters.no_responses,
+            counters.character_overruns,
+            counters.busy,
+            counters.missed,
+            counters.character_gaps,
+        ];
+        readings
+    }
+
+    /// Carries an order out, or hands it to the storage task.
+    fn carry_out(
+        center: &mut impl rtic::Mutex<T = Center>,
+        administration: &mut impl rtic::Mutex<T = Administration>,
+        command: Command,
+    ) {
+        let order = match command {
+            Command::ZeroNow => Order::ZeroNow,
+            Command::StartKeyCalibration => Order::KeyCalibration,
+            Command::SupplyPointAtZero => Order::SupplyPointAtZero,
+            Command::SupplyPointAtCurrent => Order::SupplyPointAtCurrent,
+            Command::FinishSupplyCalibration => Order::FinishSupplyCalibration,
+            Command::Abort => Order::Abort,
+            Command::ClearDiagnoses => Order::ClearDiagnoses,
+            Command::Save | Command::Restore | Command::ClearLog => {
+                center.lock(|center| center.measurement.note_command(CommandState::Running, 0));
+                administration.lock(|administration| {
+                    administration.busy = true;
+                    match command {
+                        Command::Save => administration.requests.save = true,
+                        Command::Restore => administration.requests.restore = true,
+                        _ => administration.requests.clear_log = true,
+                    }
+                });
+                return;
+            }
+            Command::FactoryDefaults => {
+                administration.lock(|administration| administration.store.factory_defaults());
+                center.lock(|center| center.measurement.note_command(CommandState::Done, 0));
+                return;
+            }
+        };
+        center.lock(|center| {
+            let Center {
+                configuration,
+                measurement,
+                ..
+            } = center;
+            if let Err(refusal) = measurement.order(configuration, order) {
+                defmt::info!("order refused: {}", refusal);
+            }
+        });
+    }
+
+    /// Reads the flash, starts the measurement, and then keeps configuration, charge and log. No deadline; a loss of
+    /// power costs at most what the save policy states.
+    #[task(priority = 1, local = [storage, previous], shared = [center, administration, meter_link])]
+    async fn storage(mut cx: storage::Context) {
+        let storage = cx.local.storage;
+        let load = async {
+            storage.start().await;
+            (storage.configuration().await, storage.state().await)
+        };
+        let loaded = Mono::timeout_after(LOAD_LIMIT_MS.millis(), load).await;
+        let (stored, state) = loaded.unwrap_or((Stored::Refused, Stored::Refused));
+        let now = time::now();
+
+        let configuration = cx.shared.administration.lock(|administration| {
+            if let Stored::Value(configuration) = &stored {
+                // It was checked when it was decoded.
+                let _ = administration.store.commit(*configuration);
+                administration.saved = Some(administration.store.generation());
+            }
+            *administration.store.active()
+        });
+        let retained = retained_state(cx.local.previous, state);
+        let (charge, meter_config) = cx.shared.center.lock(|center| {
+            let (state, slots, loss) = &retained;
+            let meter_config = center.resume(configuration, state.as_ref(), *slots, *loss, now);
+            center.identity.configuration_crc = configuration.crc();
+            if matches!(stored, Stored::Refused) {
+                center
+                    .conditions
+                    .happened
+                    .set(Code::ConfigurationDefault, true);
+            }
+            (state.as_ref().map(|state| state.charge_total), meter_config)
+        });
+        cx.shared.meter_link.lock(|link| link.config = meter_config);
+        defmt::info!(
+            "configuration {=u32:08x}, charge {}",
+            configuration.crc(),
+            charge
+        );
+        // Each is spawned once, here.
+        let _ = meter_owner::spawn(charge);
+        let _ = conversion::spawn();
+        let _ = tick::spawn();
+
+        let mut policy = SavePolicy::new(now, charge.unwrap_or(Nanocoulombs::ZERO));
+        let mut since_log_ms = 0;
+        loop {
+            Mono::delay(100.millis()).await;
+            alive(Task::Storage);
+            since_log_ms += 100;
+            let requests = cx
+                .shared
+                .administration
+                .lock(|administration| core::mem::take(&mut administration.requests));
+            if requests.save || requests.restore || requests.clear_log {
+                serve(
+                    storage,
+                    requests,
+                    &mut cx.shared.center,
+                    &mut cx.shared.administration,
+                )
+                .await;
+            }
+            let now = time::now();
+            let (state, save) = cx.shared.center.lock(|center| {
+                (
+                    center.measurement.retained(0),
+                    center.configuration.save_policy,
+                )
+            });
+            if policy.due(&save, now, state.charge_total) && storage.save_state(&state).await {
+                policy.saved(now, state.charge_total);
+            }
+            let due = cx
+                .shared
+                .center
+                .lock(|center| core::mem::take(&mut center.log_due));
+            if due || since_log_ms >= LOG_PERIOD_MS {
+                since_log_ms = 0;
+                let record = cx.shared.center.lock(|center| {
+                    let boot = center.identity.boots;
+                    center.measurement.log_record(&center.configuration, boot)
+                });
+                storage.append(&record).await;
+            }
+            supervise(
+                storage,
+                &mut cx.shared.center,
+                &mut cx.shared.administration,
+            );
+        }
+    }
+
+    /// The state to go on with, how the slots continue, and the bound on what the reset has cost.
+    fn retained_state(
+        previous: &Previous,
+        stored: Stored<RetainedState>,
+    ) -> (Option<RetainedState>, RetainSlots, Nanocoulombs) {
+        match RetainSlots::recover(&retain::slot(Slot::A), &retain::slot(Slot::B)) {
+            Ok((state, slots)) => (Some(state), slots, identity::loss_over_reset(previous)),
+            Err(_) => match stored {
+                Stored::Value(state) => (
+                    Some(state),
+                    RetainSlots::empty(),
+                    identity::loss_over_power_off(),
+                ),
+                _ => (None, RetainSlots::empty(), Nanocoulombs::ZERO),
+            },
+        }
+    }
+
+    /// Save, restore, clear the log.
+    async fn serve(
+        storage: &mut Storage,
+        requests: Requests,
+        center: &mut impl rtic::Mutex<T = Center>,
+        administration: &mut impl rtic::Mutex<T = Administration>,
+    ) {
+        let mut done = true;
+        if requests.save {
+            let (configuration, generation) = administration.lock(|administration| {
+                (
+                    *administration.store.active(),
+                    administration.store.generation(),
+                )
+            });
+            done &= storage.save_configuration(&configuration).await;
+            if done {
+                administration.lock(|administration| administration.saved = Some(generation));
+            }
+        }
+        if requests.restore {
+            match storage.configuration().await {
+                Stored::Value(configuration) => administration.lock(|administration| {
+                    done &= administration.store.commit(configuration).is_ok();
+                    administration.saved = Some(administration.store.generation());
+                }),
+                Stored::Nothing | Stored::Refused => done = false,
+            }
+        }
+        if requests.clear_log {
+            done &= storage.clear_log().await;
+        }
+        let state = if done {
+            CommandState::Done
+        } else {
+            CommandState::Failed
+        };
+        center.lock(|center| center.measurement.note_command(state, 0));
+        administration.lock(|administration| administration.busy = false);
+    }
+
+    /// Once per turn of the storage task: its conditions; once a second the stack and the state.
+    fn supervise(
+        storage: &mut Storage,
+        center: &mut impl rtic::Mutex<T = Center>,
+        administration: &mut impl rtic::Mutex<T = Administration>,
+    ) {
+        let (failed, log_full) = storage.take_conditions();
+        let counters = storage.counters();
+        let due = center.lock(|center| {
+            center.conditions.flash_fault |= failed;
+            center.conditions.log_full |= log_full;
+            center.second_passed()
+        });
+        administration.lock(|administration| {
+            administration.flash_counters = [
+                counters.written,
+                counters.erased,
+                counters.failures,
+                counters.refused,
+                counters.lost,
+            ];
+        });
+        if !due {
+            return;
+        }
+        let used = stack::high_water_bytes();
+        let (current, charge) = center.lock(|center| {
+            let free = stack::BYTES.saturating_sub(used);
+            center.conditions.little_stack = free < STACK_RESERVE;
+            center.identity.stack_free = u32::try_from(free).unwrap_or(0);
+            (center.measurement.current(), center.measurement.charge())
+        });
+        defmt::info!(
+            "{} {}, {} {}, stack {}",
+            current.current,
+            current.validity,
+            charge.charge,
+            charge.validity,
+            used
+        );
+    }
+}

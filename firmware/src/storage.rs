@@ -1,0 +1,273 @@
+//! What is in the flash: configuration, charge and the log, each in its own region, by sequential-storage.
+//!
+//! | region | content | kept as |
+//! |---|---|---|
+//! | 0x00_0000 … 0x00_4000 | configuration record | map, key 0 |
+//! | 0x01_0000 … 0x02_0000 | retained state | map, key 0 |
+//! | 0x20_0000 … 0x40_0000 | log | queue, the oldest sector is overwritten |
+//!
+//! A loss of power in any write leaves the old or the new item (sequential-storage's own guarantee); each record has a
+//! CRC-32 of `core_logic` besides. Everything here runs at priority 1 and waits asynchronously.
+
+use core::ops::Range;
+
+use core_logic::{
+    configuration::{self, Configuration, ConfigurationError, MAX_RECORD},
+    retained::{LogRecord, MAX_LOG_BYTES, MAX_STATE_BYTES, RetainedState},
+};
+use embedded_storage_async::nor_flash::{NorFlash, ReadNorFlash};
+use sequential_storage::{
+    Error,
+    cache::Cache,
+    map::{MapConfig, MapStorage},
+    queue::{QueueConfig, QueueStorage},
+};
+use stm32f4xx_hal::{
+    gpio::{Output, PB12},
+    pac::SPI2,
+};
+
+use crate::{flash, flash::Flash, spi};
+
+type Chip = Flash<spi::Device<SPI2, PB12<Output>>>;
+
+const CONFIGURATION: Range<u32> = 0x00_0000..0x00_4000;
+const STATE: Range<u32> = 0x01_0000..0x02_0000;
+const LOG: Range<u32> = 0x20_0000..0x40_0000;
+/// The only key of either map.
+const KEY: u8 = 0;
+/// Longest record with its key.
+const BUFFER: usize = MAX_RECORD + 8;
+
+/// What happened since the start; each stops at its end.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Records written.
+    pub written: u32,
+    /// Sectors erased to clear the log; those that sequential-storage erases on its way are not counted.
+    pub erased: u32,
+    /// Failed writes and erases.
+    pub failures: u32,
+    /// Records that were read and refused.
+    pub refused: u32,
+    /// Log records lost.
+    pub lost: u32,
+}
+
+fn count(counter: &mut u32) {
+    *counter = counter.saturating_add(1);
+}
+
+/// What the flash held at the start.
+pub enum Stored<T> {
+    /// This.
+    Value(T),
+    /// Nothing yet.
+    Nothing,
+    /// Something that must not be used, or the flash could not be read.
+    Refused,
+}
+
+/// The flash with its regions.
+pub struct Storage {
+    flash: Chip,
+    buffer: [u8; BUFFER],
+    record: [u8; MAX_RECORD],
+    counters: Counters,
+    ready: bool,
+    log_full: bool,
+    failed: bool,
+    overwrites: bool,
+}
+
+impl Storage {
+    /// Takes the bus. No transfer takes place.
+    pub fn new(spi: spi::Device<SPI2, PB12<Output>>) -> Self {
+        Self {
+            flash: Flash::new(spi),
+            buffer: [0; BUFFER],
+            record: [0; MAX_RECORD],
+            counters: Counters::default(),
+            ready: false,
+            log_full: false,
+            failed: false,
+            overwrites: false,
+        }
+    }
+
+    /// What happened so far.
+    pub const fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// Whether the flash has failed, and the log has begun to overwrite its oldest records, since the last call.
+    pub const fn take_conditions(&mut self) -> (bool, bool) {
+        (
+            core::mem::replace(&mut self.failed, false),
+            core::mem::replace(&mut self.overwrites, false),
+        )
+    }
+
+    /// Wakes the chip. Without it nothing is read or written.
+    pub async fn start(&mut self) {
+        match self.flash.start().await {
+            Ok(()) => self.ready = true,
+            Err(error) => {
+                defmt::error!("flash: {}", error);
+                self.failed = true;
+            }
+        }
+    }
+
+    /// The stored configuration.
+    pub async fn configuration(&mut self) -> Stored<Configuration> {
+        match self.fetch(CONFIGURATION).await {
+            Ok(Some(bytes)) => match configuration::decode(bytes) {
+                Ok(configuration) => Stored::Value(configuration),
+                Err(error) => {
+                    self.refuse(&error);
+                    Stored::Refused
+                }
+            },
+            Ok(None) => Stored::Nothing,
+            Err(()) => Stored::Refused,
+        }
+    }
+
+    fn refuse(&mut self, error: &ConfigurationError) {
+        // Not `Display`: the formatting of every field's name and limits would cost 3 KiB of flash.
+        let reason = match error {
+            ConfigurationError::TooShort { .. } => "too short",
+            ConfigurationError::WrongVersion { .. } => "another version",
+            ConfigurationError::TrailingBytes(_) => "too long",
+            ConfigurationError::WrongCrc { .. } => "wrong CRC",
+            ConfigurationError::Malformed => "no configuration",
+            ConfigurationError::Invalid(_) => "beyond its limits",
+        };
+        defmt::error!("stored configuration refused: {=str}", reason);
+        count(&mut self.counters.refused);
+    }
+
+    /// The stored charge and state of charge.
+    pub async fn state(&mut self) -> Stored<RetainedState> {
+        match self.fetch(STATE).await {
+            Ok(Some(bytes)) => match RetainedState::decode(bytes) {
+                Ok(state) => Stored::Value(state),
+                Err(error) => {
+                    defmt::error!("stored state refused: {}", error);
+                    count(&mut self.counters.refused);
+                    Stored::Refused
+                }
+            },
+            Ok(None) => Stored::Nothing,
+            Err(()) => Stored::Refused,
+        }
+    }
+
+    async fn fetch(&mut self, region: Range<u32>) -> Result<Option<&[u8]>, ()> {
+        if !self.ready {
+            return Err(());
+        }
+        let Some(config) = MapConfig::try_new(region).ok() else {
+            return Err(());
+        };
+        let mut map = MapStorage::<u8, _, _>::new(&mut self.flash, config, Cache::new_uncached());
+        map.fetch_item::<&[u8]>(&mut self.buffer, &KEY)
+            .await
+            .map_err(|error| log(&error))
+    }
+
+    /// Writes the configuration; whether it is in the flash.
+    pub async fn save_configuration(&mut self, configuration: &Configuration) -> bool {
+        let Ok(record) = configuration::encode(configuration, &mut self.record) else {
+            return false;
+        };
+        let length = record.len();
+        self.store(CONFIGURATION, length).await
+    }
+
+    /// Writes charge and state of charge; whether they are in the flash.
+    pub async fn save_state(&mut self, state: &RetainedState) -> bool {
+        let Some(buffer) = self.record.get_mut(..MAX_STATE_BYTES) else {
+            return false;
+        };
+        let Ok(record) = state.encode(buffer) else {
+            return false;
+        };
+        let length = record.len();
+        self.store(STATE, length).await
+    }
+
+    /// Writes the first `length` bytes of `record`.
+    async fn store(&mut self, region: Range<u32>, length: usize) -> bool {
+        let (Some(record), true) = (self.record.get(..length), self.ready) else {
+            return false;
+        };
+        let Some(config) = MapConfig::try_new(region).ok() else {
+            return false;
+        };
+        let mut map = MapStorage::<u8, _, _>::new(&mut self.flash, config, Cache::new_uncached());
+        let result = map
+            .store_item::<&[u8]>(&mut self.buffer, &KEY, &record)
+            .await;
+        self.note(result.map_err(|error| log(&error)))
+    }
+
+    fn note(&mut self, result: Result<(), ()>) -> bool {
+        match result {
+            Ok(()) => count(&mut self.counters.written),
+            Err(()) => {
+                count(&mut self.counters.failures);
+                self.failed = true;
+            }
+        }
+        result.is_ok()
+    }
+
+    /// Appends to the log, over its oldest records when it is full.
+    pub async fn append(&mut self, record: &LogRecord) {
+        let mut buffer = [0; MAX_LOG_BYTES];
+        let (Ok(bytes), true) = (record.encode(&mut buffer), self.ready) else {
+            count(&mut self.counters.lost);
+            return;
+        };
+        let Some(config) = QueueConfig::try_new(LOG).ok() else {
+            return;
+        };
+        let mut queue = QueueStorage::new(&mut self.flash, config, Cache::new_uncached());
+        let mut result = queue.push(bytes, self.log_full).await;
+        if matches!(result, Err(Error::FullStorage)) {
+            (self.log_full, self.overwrites) = (true, true);
+            result = queue.push(bytes, true).await;
+        }
+        if !self.note(result.map_err(|error| log(&error))) {
+            count(&mut self.counters.lost);
+        }
+    }
+
+    /// Erases the log: the sectors that were written, 45 ms each, at most 400 ms.
+    pub async fn clear_log(&mut self) -> bool {
+        let sector = u32::try_from(flash::SECTOR).unwrap_or(u32::MAX);
+        let mut at = LOG.start;
+        while at < LOG.end {
+            let mut mark = [0; 4];
+            let blank = self.flash.read(at, &mut mark).await.is_ok() && mark == [0xFF; 4];
+            if !blank && let Err(error) = self.flash.erase(at, at + sector).await {
+                defmt::error!("flash: {}", error);
+                count(&mut self.counters.failures);
+                self.failed = true;
+                return false;
+            }
+            if !blank {
+                count(&mut self.counters.erased);
+            }
+            at += sector;
+        }
+        self.log_full = false;
+        true
+    }
+}
+
+fn log(error: &Error<flash::Error<spi::Error>>) {
+    defmt::error!("storage: {}", error);
+}

@@ -1,0 +1,37 @@
+//! The independent watchdog. It runs from its own oscillator (LSI, 17 … 47 kHz), so it also ends a start-up that waits
+//! for a crystal that does not swing; and it can never be stopped again.
+
+use stm32f4xx_hal::pac::IWDG;
+
+/// 0.68 … 1.88 s over the tolerance of LSI, 1.0 s nominal.
+const RELOAD: u16 = 1_000 - 1;
+
+/// The start runs from HSI, 16 MHz, and a poll takes at least six clocks.
+const UPDATE_POLLS: u32 = 25_000;
+
+/// The running watchdog.
+pub struct Watchdog(IWDG);
+
+impl Watchdog {
+    /// Starts it, and waits until prescaler and reload value have reached its clock domain, five periods of LSI: a feed
+    /// before that would load the reset's 4 s. The wait ends after 10 ms at the latest; the watchdog runs either way.
+    pub fn start(iwdg: IWDG) -> Self {
+        iwdg.kr().write(|w| w.key().start());
+        iwdg.kr().write(|w| w.key().unlock());
+        // LSI / 32: 1 ms at the nominal 32 kHz.
+        iwdg.pr().write(|w| w.pr().divide_by32());
+        iwdg.rlr().write(|w| w.rl().set(RELOAD));
+        for _ in 0..UPDATE_POLLS {
+            if iwdg.sr().read().bits() == 0 {
+                break;
+            }
+        }
+        iwdg.kr().write(|w| w.key().feed());
+        Self(iwdg)
+    }
+
+    /// One more period.
+    pub fn feed(&mut self) {
+        self.0.kr().write(|w| w.key().feed());
+    }
+}
