@@ -1486,9 +1486,9 @@ pub(crate) mod tests {
                 };
                 converter.is_stuck(&config, 4_096, at(us), &context)
             };
-            assert!(!step(0, 90));
-            assert!(!step(second, 50));
-            assert_eq!(step(third, 20), expected);
+            assert!(!step(1_000_000, 90));
+            assert!(!step(1_000_000 + second, 50));
+            assert_eq!(step(1_000_000 + third, 20), expected);
         }
     }
 
