@@ -1,0 +1,134 @@
+//! The project's commands: `cargo xtask test`, `build`, `size`, `flash`, `doc`, `setup`.
+//!
+//! Everything a command needs beyond a Rust compiler for the host (a compiler for the board, QEMU, Python's
+//! `cantools`) is found or installed by the command itself; docs/toolchain.md says how.
+
+mod apt;
+mod dbc;
+mod doc;
+mod flash;
+mod image;
+mod instruction_count;
+mod lint;
+mod process;
+mod python;
+mod qemu;
+mod report;
+mod size;
+mod stack;
+mod steps;
+mod sysroot;
+mod test_command;
+mod tests_on_host;
+mod thumb;
+mod toolchain;
+mod workspace;
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::{Parser, Subcommand};
+
+use crate::{flash::FlashOutcome, steps::Steps, workspace::Workspace};
+
+/// The check asked for failed.
+const FAILED: u8 = 1;
+/// Something the command needs is not there (a probe, a tool).
+const MISSING: u8 = 2;
+
+#[derive(Parser)]
+#[command(
+    name = "cargo xtask",
+    bin_name = "cargo xtask",
+    version,
+    about = "The commands of the Hallmark board"
+)]
+#[command(
+    after_help = "Example:\n  cargo xtask test      set up what is missing, then run every check and test"
+)]
+struct CommandLine {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Set up what is missing, then run every check and every test
+    #[command(after_help = "Example:\n  cargo xtask test")]
+    Test,
+    /// Build the release image and print where its ELF file is
+    #[command(after_help = "Example:\n  arm-none-eabi-objdump -d \"$(cargo xtask build)\"")]
+    Build,
+    /// Print flash, static RAM, the stack bound and instruction counts against their limits
+    #[command(after_help = "Example:\n  cargo xtask size\n  cargo xtask size --calls")]
+    Size {
+        /// Also list the deepest calls and the functions behind each remark
+        #[arg(long)]
+        calls: bool,
+    },
+    /// Build the image, flash it with probe-rs and stream its defmt log
+    #[command(after_help = "Example:\n  cargo xtask flash")]
+    Flash,
+    /// Build the documentation of the host crates and print where it is
+    #[command(after_help = "Example:\n  cargo xtask doc")]
+    Doc,
+    /// Only install what the other commands need
+    #[command(after_help = "Example:\n  cargo xtask setup")]
+    Setup,
+}
+
+fn main() -> ExitCode {
+    let command = CommandLine::parse().command;
+    match run(&command) {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::from(FAILED)
+        }
+    }
+}
+
+fn run(command: &Command) -> Result<ExitCode> {
+    let workspace = Workspace::find()?;
+    match command {
+        Command::Test => Ok(if test_command::run(&workspace)? {
+            ExitCode::SUCCESS
+        } else {
+            ExitCode::from(FAILED)
+        }),
+        Command::Build => {
+            let toolchain = toolchain::choose(&workspace)?;
+            println!("{}", image::build(&workspace, &toolchain)?.display());
+            Ok(ExitCode::SUCCESS)
+        }
+        Command::Size { calls } => {
+            let toolchain = toolchain::choose(&workspace)?;
+            let mut steps = Steps::default();
+            report::size_of_image(&mut steps, &workspace, &toolchain, *calls);
+            Ok(if steps.print_failures() {
+                ExitCode::from(FAILED)
+            } else {
+                ExitCode::SUCCESS
+            })
+        }
+        Command::Flash => match flash::run(&workspace)? {
+            FlashOutcome::Ran => Ok(ExitCode::SUCCESS),
+            FlashOutcome::Missing(what) => {
+                eprintln!("error: {what}");
+                Ok(ExitCode::from(MISSING))
+            }
+        },
+        Command::Doc => {
+            println!("{}", doc::build(&workspace)?.display());
+            Ok(ExitCode::SUCCESS)
+        }
+        Command::Setup => {
+            workspace::check_host_components()?;
+            let toolchain = toolchain::choose_again(&workspace)?;
+            eprintln!("firmware compiler: {}", toolchain.describe());
+            eprintln!("qemu: {}", qemu::find()?.display());
+            eprintln!("python: {}", python::environment(&workspace)?.display());
+            Ok(ExitCode::SUCCESS)
+        }
+    }
+}
