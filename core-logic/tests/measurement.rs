@@ -299,6 +299,90 @@ fn a_bad_supply_is_reported_and_never_measured_with() {
     }
 }
 
+/// A real drive with 400 A peaks and ideal sensors: whatever is reported is a false alarm.
+#[test]
+fn a_real_drive_raises_no_diagnosis() {
+    let path = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../recordings/panasonic-18650pf/25c-us06.csv"
+    );
+    let mut reader = csv::Reader::from_path(path).unwrap();
+    let rows: Vec<Row> = reader
+        .records()
+        .map(|record| {
+            let record = record.unwrap();
+            let number = |index: usize| record[index].parse::<f64>().unwrap();
+            Row {
+                t_s: number(0),
+                current_a: 19.0 * number(1),
+                cell_v: number(2),
+            }
+        })
+        .take_while(|row| row.t_s < 2_000.0)
+        .collect();
+    assert!(rows.len() > 19_000, "{}", rows.len());
+    let mut board = board(&rows);
+    let mut raised = Vec::new();
+    while let Some(step) = board.step() {
+        if let Step::Tick(tick) = step {
+            raised.extend(tick.changes.set.iter().filter(|code| {
+                // True: nothing has anchored it, and the bus says so.
+                *code != Code::SocUncertain
+            }));
+        }
+    }
+    assert!(board.world.edges > 400, "{}", board.world.edges);
+    assert!(raised.is_empty(), "{raised:?}");
+    assert!(board.charge_error_c().abs() <= ideal_bound_c(&board, &rows));
+}
+
+/// A triangle of ±40 A with a period of 8 s: enough for every comparison of the two channels.
+fn triangle() -> Vec<Row> {
+    let points: Vec<(f64, f64)> = (0..16)
+        .map(|i| (f64::from(i) * 4.0, if i % 2 == 0 { -40.0 } else { 40.0 }))
+        .collect();
+    rows(&points)
+}
+
+fn raised_within_s(mut board: HostBoard<'_>, code: Code) -> Option<f64> {
+    let begin = board.now_us;
+    board
+        .run_until(|board| board.measurement.diagnosis().active().contains(code))
+        .then(|| (board.now_us - begin) as f64 * 1e-6)
+}
+
+#[test]
+fn a_meter_that_stops_counting_is_found_within_a_second() {
+    let rows = triangle();
+    let mut board = board(&rows);
+    assert!(board.run_until(|board| board.now_us > 13_000_000));
+    // The current passes 0 A at 14 s, the worst moment.
+    board.frozen = true;
+    let after = raised_within_s(board, Code::MeterFrozen).unwrap();
+    assert!(after <= 1.0, "{after} s");
+}
+
+#[test]
+fn a_converter_that_repeats_itself_is_found_by_the_meter_beside_it() {
+    let rows = triangle();
+    let mut board = board(&rows);
+    assert!(board.run_until(|board| board.now_us > 13_000_000));
+    board.stuck_code = Some(4_100);
+    let after = raised_within_s(board, Code::ConverterStuck).unwrap();
+    assert!(after <= 4.0, "{after} s");
+}
+
+/// What floats at 2.5 V behind the switch reads like 0 A: the other channel contradicts it.
+#[test]
+fn a_converter_input_that_reads_like_0_amps_is_found_by_the_charge() {
+    let rows = rows(&[(0.0, 20.0), (30.0, 20.0)]);
+    let mut board = board(&rows);
+    assert!(board.run_until(|board| board.now_us > 13_000_000));
+    board.stuck_code = Some(4_096);
+    let after = raised_within_s(board, Code::ChannelsDisagree).unwrap();
+    assert!(after <= 3.0, "{after} s");
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 

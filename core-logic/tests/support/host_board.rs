@@ -32,6 +32,11 @@ pub struct HostBoard<'a> {
     /// What the open-sensor channel shows instead of the small sensor's output.
     pub network: Option<Microvolts>,
     pub external: CodeSet,
+    /// The converter delivers this code whatever its input.
+    pub stuck_code: Option<i16>,
+    /// AENERGY stands still.
+    pub frozen: bool,
+    energy: i32,
     /// The true charge at the first and at the newest reading of the meter, in C: between them it has counted.
     pub first_reading_c: Option<f64>,
     pub last_reading_c: f64,
@@ -69,6 +74,9 @@ impl<'a> HostBoard<'a> {
             supply: Some(Microvolts::from_millivolts(5_000)),
             network: None,
             external: CodeSet::EMPTY,
+            stuck_code: None,
+            frozen: false,
+            energy: 0,
             first_reading_c: None,
             last_reading_c: 0.0,
             sender: can::Sender::default(),
@@ -97,8 +105,15 @@ impl<'a> HostBoard<'a> {
                 self.last_reading_c = self.world.charge_c;
                 self.first_reading_c.get_or_insert(self.world.charge_c);
                 let at = Instant::from_ticks(at_us);
+                if !self.frozen {
+                    self.energy = counts;
+                }
+                let reading = MeterReading {
+                    energy: self.energy,
+                    at,
+                };
                 self.meter
-                    .on_reading(MeterReading { energy: counts, at }, self.edges.history(at));
+                    .on_reading(reading, self.edges.history(at));
                 self.measurement
                     .on_meter(&self.configuration, &self.meter.report(), Validity::VALID);
             }
@@ -115,7 +130,7 @@ impl<'a> HostBoard<'a> {
                         started: Instant::from_ticks(started_us),
                         finished: at,
                         configuration: self.configuration.converter.expected_configuration(),
-                        code,
+                        code: self.stuck_code.unwrap_or(code),
                     },
                     &self.edges.history(at),
                 );
