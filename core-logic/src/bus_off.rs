@@ -56,15 +56,16 @@ pub struct BusOff {
 impl BusOff {
     /// To be called with the controller's bus-off flag at least every 10 ms and at once when the flag rises.
     pub fn step(&mut self, now: Instant, bus_off: bool) -> Action {
+        // The error-free time counts to its very end.
+        if let State::On { since } = self.state
+            && elapsed(since, now) >= ERROR_FREE_TIME
+        {
+            self.attempts = 0;
+        }
         match (self.state, bus_off) {
             (State::Start, false) => self.state = State::On { since: now },
-            (State::On { since }, false) => {
-                if elapsed(since, now) >= ERROR_FREE_TIME {
-                    self.attempts = 0;
-                }
-            }
+            (State::On { .. }, false) => {}
             (State::Start | State::On { .. }, true) => {
-                self.step(now, false); // the error-free time counts to its very end
                 self.bus_offs = self.bus_offs.saturating_add(1);
                 self.state = State::Off { since: now };
             }

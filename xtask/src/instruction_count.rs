@@ -9,7 +9,7 @@ use crate::{image, qemu, toolchain::Toolchain};
 struct Count {
     name: String,
     instructions: u32,
-    limit: u32,
+    limit: Option<u32>,
 }
 
 /// Builds and runs the measurements; an error if one takes more than its limit.
@@ -22,7 +22,8 @@ pub fn run(toolchain: &Toolchain) -> Result<()> {
         limit,
     } in &counts
     {
-        println!("   {name:<52} {instructions:>6} instructions of {limit}");
+        let limit = limit.map_or_else(String::new, |limit| format!(" of {limit}"));
+        println!("   {name:<52} {instructions:>6} instructions{limit}");
     }
     check(&counts)
 }
@@ -45,7 +46,10 @@ fn parse_line(line: &str) -> Option<Count> {
     (!name.is_empty()).then_some(Count {
         name: name.to_owned(),
         instructions: count.parse().ok()?,
-        limit: limit.parse().ok()?,
+        limit: match limit {
+            "-" => None,
+            limit => Some(limit.parse().ok()?),
+        },
     })
 }
 
@@ -55,12 +59,12 @@ fn check(counts: &[Count]) -> Result<()> {
     }
     let over: Vec<String> = counts
         .iter()
-        .filter(|count| count.instructions > count.limit)
-        .map(|count| {
-            format!(
-                "{} takes {} instructions of {}",
-                count.name, count.instructions, count.limit
-            )
+        .filter_map(|count| {
+            let limit = count.limit.filter(|limit| count.instructions > *limit)?;
+            Some(format!(
+                "{} takes {} instructions of {limit}",
+                count.name, count.instructions
+            ))
         })
         .collect();
     if !over.is_empty() {
@@ -76,19 +80,24 @@ mod tests {
 
     #[test]
     fn counts_and_limits_are_read() {
-        let counts = parse("143 200 range edge: worst of 4\n7 800 sample\n").unwrap();
+        let counts = parse("143 200 range edge: worst of 4\n7 800 sample\n900 - all\n").unwrap();
         assert_eq!(
             counts,
             [
                 Count {
                     name: "range edge: worst of 4".into(),
                     instructions: 143,
-                    limit: 200
+                    limit: Some(200)
                 },
                 Count {
                     name: "sample".into(),
                     instructions: 7,
-                    limit: 800
+                    limit: Some(800)
+                },
+                Count {
+                    name: "all".into(),
+                    instructions: 900,
+                    limit: None
                 },
             ]
         );

@@ -1,10 +1,11 @@
-//! The project's commands: `cargo xtask test`, `build`, `size`, `flash`, `doc`, `setup`.
+//! The project's commands: `cargo xtask demo`, `test`, `build`, `size`, `flash`, `doc`, `setup`.
 //!
 //! Everything a command needs beyond a Rust compiler for the host (a compiler for the board, QEMU, Python's
 //! `cantools`) is found or installed by the command itself; docs/toolchain.md says how.
 
 mod apt;
 mod dbc;
+mod demo;
 mod doc;
 mod flash;
 mod image;
@@ -44,7 +45,7 @@ const MISSING: u8 = 2;
     about = "The commands of the Hallmark board"
 )]
 #[command(
-    after_help = "Example:\n  cargo xtask test      set up what is missing, then run every check and test"
+    after_help = "Examples:\n  cargo xtask demo      a recorded drive through the measuring logic\n  cargo xtask test      set up what is missing, then run every check and test"
 )]
 struct CommandLine {
     #[command(subcommand)]
@@ -53,6 +54,9 @@ struct CommandLine {
 
 #[derive(Subcommand)]
 enum Command {
+    /// Drive a recorded current through the measuring logic and say what it made of it
+    #[command(after_help = "Example:\n  cargo xtask demo")]
+    Demo,
     /// Set up what is missing, then run every check and every test
     #[command(after_help = "Example:\n  cargo xtask test")]
     Test,
@@ -91,6 +95,10 @@ fn main() -> ExitCode {
 fn run(command: &Command) -> Result<ExitCode> {
     let workspace = Workspace::find()?;
     match command {
+        Command::Demo => {
+            demo::run(&workspace)?;
+            Ok(ExitCode::SUCCESS)
+        }
         Command::Test => Ok(if test_command::run(&workspace)? {
             ExitCode::SUCCESS
         } else {
