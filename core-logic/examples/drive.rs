@@ -59,7 +59,10 @@ fn read(path: &str, scale: f64) -> Result<Vec<Row>, Box<dyn Error>> {
     let need = |name: &str| {
         find(name).ok_or_else(|| {
             let columns: Vec<&str> = header.iter().collect();
-            format!("{path}, line 1: no column {name:?}; the file has {}", columns.join(", "))
+            format!(
+                "{path}, line 1: no column {name:?}; the file has {}",
+                columns.join(", ")
+            )
         })
     };
     let (time, current, cell) = (need("t_s")?, need("i_ref_a")?, find("v_cell_v"));
@@ -114,7 +117,10 @@ fn drive(recording: &str, scale: &str, out: &Path) -> Result<String, Box<dyn Err
     fs::create_dir_all(out)?;
     let mut can_log = BufWriter::new(File::create(out.join("can.log"))?);
     let mut table = BufWriter::new(File::create(out.join("drive.csv"))?);
-    writeln!(table, "t_s,i_ref_a,i_meas_a,q_ref_c,q_meas_c,range_high,soc_pct")?;
+    writeln!(
+        table,
+        "t_s,i_ref_a,i_meas_a,q_ref_c,q_meas_c,range_high,soc_pct"
+    )?;
 
     let mut configuration = Configuration::default();
     // The cell's 2.9 Ah, scaled as its current is.
@@ -210,28 +216,78 @@ fn drive(recording: &str, scale: &str, out: &Path) -> Result<String, Box<dyn Err
     let report = board.meter.report();
     let mut summary = String::new();
     let s = &mut summary;
-    writeln!(s, "recording        {recording} × {factor}: {} rows, {elapsed_s:.0} s, rms {rms:.1} A", rows.len())?;
-    writeln!(s, "range changes    {} across ±53.33 A, {} handed over one by one, {} estimated", board.world.edges, report.hand_overs, report.estimated_intervals)?;
-    writeln!(s, "charge           {:.3} As flowed out net, {through_c:.0} As both ways", board.world.charge_c)?;
-    writeln!(s, "board            {:.3} As, error {error_c:+.3} As = {:+.5} % of both ways; bound {bound_c:.1} As", report.charge_total.get() as f64 * 1e-9, 100.0 * error_c / through_c)?;
-    writeln!(s, "current          {valid} conversions valid, {invalid} marked invalid; up to {:.2} A by the small sensor, {:.1} A by the large one", largest_current[Range::Small as usize], largest_current[Range::Large as usize])?;
+    writeln!(
+        s,
+        "recording        {recording} × {factor}: {} rows, {elapsed_s:.0} s, rms {rms:.1} A",
+        rows.len()
+    )?;
+    writeln!(
+        s,
+        "range changes    {} across ±53.33 A, {} handed over one by one, {} estimated",
+        board.world.edges, report.hand_overs, report.estimated_intervals
+    )?;
+    writeln!(
+        s,
+        "charge           {:.3} As flowed out net, {through_c:.0} As both ways",
+        board.world.charge_c
+    )?;
+    writeln!(
+        s,
+        "board            {:.3} As, error {error_c:+.3} As = {:+.5} % of both ways; bound {bound_c:.1} As",
+        report.charge_total.get() as f64 * 1e-9,
+        100.0 * error_c / through_c
+    )?;
+    writeln!(
+        s,
+        "current          {valid} conversions valid, {invalid} marked invalid; up to {:.2} A by the small sensor, {:.1} A by the large one",
+        largest_current[Range::Small as usize],
+        largest_current[Range::Large as usize]
+    )?;
     let soc = board.measurement.state_of_charge();
     let share = |ppm: core_logic::units::Ppm| f64::from(ppm.get()) * 1e-4;
     match soc.uncertainty {
-        Some(uncertainty) => writeln!(s, "state of charge  {:.2} % ± {:.2} % at the end", share(soc.state_of_charge), share(uncertainty))?,
-        None => writeln!(s, "state of charge  not known: the recording has no rest on which it could be anchored; marked so on the bus")?,
+        Some(uncertainty) => writeln!(
+            s,
+            "state of charge  {:.2} % ± {:.2} % at the end",
+            share(soc.state_of_charge),
+            share(uncertainty)
+        )?,
+        None => writeln!(
+            s,
+            "state of charge  not known: the recording has no rest on which it could be anchored; marked so on the bus"
+        )?,
     }
     match first_valid_ms {
         Some(ms) => writeln!(s, "first valid      {ms} ms after the start")?,
         None => writeln!(s, "first valid      never")?,
     }
     let names: Vec<&str> = seen.iter().map(|code| code.description().name).collect();
-    writeln!(s, "diagnoses        {}", if names.is_empty() { "none".into() } else { names.join(", ") })?;
-    writeln!(s, "on the bus       {frames} frames in {}", out.join("can.log").display())?;
+    writeln!(
+        s,
+        "diagnoses        {}",
+        if names.is_empty() {
+            "none".into()
+        } else {
+            names.join(", ")
+        }
+    )?;
+    writeln!(
+        s,
+        "on the bus       {frames} frames in {}",
+        out.join("can.log").display()
+    )?;
     writeln!(s, "truth beside it  {}", out.join("drive.csv").display())?;
-    writeln!(s, "took             {:.2} s, {:.0} times real time", started.elapsed().as_secs_f64(), elapsed_s / started.elapsed().as_secs_f64())?;
+    writeln!(
+        s,
+        "took             {:.2} s, {:.0} times real time",
+        started.elapsed().as_secs_f64(),
+        elapsed_s / started.elapsed().as_secs_f64()
+    )?;
     if error_c.abs() > bound_c {
-        return Err(format!("{summary}\nthe charge error {error_c} As exceeds its bound {bound_c} As").into());
+        return Err(format!(
+            "{summary}\nthe charge error {error_c} As exceeds its bound {bound_c} As"
+        )
+        .into());
     }
     Ok(summary)
 }

@@ -350,7 +350,11 @@ fn prepare(
     let corrections = Corrections {
         key_factors: PerRange {
             small: factors,
-            large: if two_ranges { KeyFactors::NONE } else { factors },
+            large: if two_ranges {
+                KeyFactors::NONE
+            } else {
+                factors
+            },
         },
         gain: configuration.current_gain,
         zero_drift: configuration.zero_drift.value,
@@ -531,7 +535,12 @@ impl Measurement {
     }
 
     /// What the meter has counted, and the causes against it that its owner knows (chip fault, self-test).
-    pub fn on_meter(&mut self, configuration: &Configuration, report: &MeterReport, causes: Validity) {
+    pub fn on_meter(
+        &mut self,
+        configuration: &Configuration,
+        report: &MeterReport,
+        causes: Validity,
+    ) {
         self.meter = *report;
         self.meter_causes = causes
             .and_if(report.at.is_none(), Validity::STALE)
@@ -544,7 +553,11 @@ impl Measurement {
             &SocInput {
                 now,
                 charge_total: report.charge_total,
-                current: self.reading.validity.is_valid().then_some(self.reading.current),
+                current: self
+                    .reading
+                    .validity
+                    .is_valid()
+                    .then_some(self.reading.current),
                 cell_voltage: self.cell_voltage,
             },
         );
@@ -553,9 +566,7 @@ impl Measurement {
 
     /// A battery voltage received over CAN.
     pub fn on_battery_voltage(&mut self, voltage: &can::BatteryVoltage, at: Instant) {
-        self.cell_voltage = voltage
-            .cell
-            .map(|voltage| CellVoltage { voltage, at });
+        self.cell_voltage = voltage.cell.map(|voltage| CellVoltage { voltage, at });
         self.pack_voltage = voltage.pack;
     }
 
@@ -580,7 +591,11 @@ impl Measurement {
         self.history = *history;
         self.reading = self.converter.reading(&self.prepared.converter, now);
         self.chatter = self.chatter_detector.step(&configuration.chatter, history);
-        let measured = self.reading.validity.without(Validity::SATURATED).is_valid();
+        let measured = self
+            .reading
+            .validity
+            .without(Validity::SATURATED)
+            .is_valid();
         self.key_outputs = self.key.step(
             &configuration.key_calibration,
             &KeyInputs {
@@ -668,9 +683,10 @@ impl Measurement {
                 Ok(CommandState::Running)
             }
             Order::SupplyPointAtZero => self.supply_point(configuration, Run::Zero),
-            Order::SupplyPointAtCurrent => {
-                self.supply_point(configuration, Run::Loaded(configuration.supply_test_current))
-            }
+            Order::SupplyPointAtCurrent => self.supply_point(
+                configuration,
+                Run::Loaded(configuration.supply_test_current),
+            ),
             Order::FinishSupplyCalibration => {
                 let FrontEnd::ClosedLoop(sensor) = configuration.front_end else {
                     return Err(Refusal::NotForThisFrontEnd);
@@ -745,7 +761,11 @@ impl Measurement {
     ) -> SampleContext {
         let two_ranges = configuration.front_end.has_two_ranges();
         SampleContext {
-            range: if two_ranges { history.range } else { Range::Small },
+            range: if two_ranges {
+                history.range
+            } else {
+                Range::Small
+            },
             spoiled_by_edge: two_ranges
                 && history.conversion_spoiled(started, configuration.converter.settling()),
             meter_mean: self.meter_mean(),
@@ -815,7 +835,10 @@ impl Measurement {
             .filter(|_| !self.open_sensor.finding(Range::Small).is_fault())
             .map(|volts| {
                 let hall = hall_voltage(volts);
-                let supply = self.prepared.supply.unwrap_or(design::SENSOR_NOMINAL_SUPPLY);
+                let supply = self
+                    .prepared
+                    .supply
+                    .unwrap_or(design::SENSOR_NOMINAL_SUPPLY);
                 let rated = mul_div(
                     i64::from(hall.get()),
                     i64::from(design::SENSOR_NOMINAL_SUPPLY.get()),
@@ -1233,7 +1256,10 @@ impl Measurement {
         readings.soc_validity = self.soc_validity();
         readings.remaining_charge = self.soc_reading.remaining;
         readings.soc_anchors = self.soc_reading.anchors;
-        let cell = self.cell_voltage.map(|cell| cell.voltage).unwrap_or_default();
+        let cell = self
+            .cell_voltage
+            .map(|cell| cell.voltage)
+            .unwrap_or_default();
         readings.cell_voltage = Millivolts(clamp_i32(div_round(i64::from(cell.get()), 1_000)));
         readings.pack_voltage = self.pack_voltage.unwrap_or_default();
         readings.cell_validity =

@@ -175,14 +175,22 @@ pub struct RangeHistory {
 }
 
 impl RangeHistory {
-    /// No edge, no time spent: what a board with a single sensor hands on.
+    /// No edge since the start of the board, all of the time in `range`: what a board with a single sensor hands on.
     #[must_use]
     pub const fn steady(now: Instant, range: Range) -> Self {
+        let (none, all) = (
+            Duration::from_ticks(0),
+            Duration::from_ticks(now.as_ticks()),
+        );
+        let (small, large) = match range {
+            Range::Small => (all, none),
+            Range::Large => (none, all),
+        };
         Self {
             range,
             at: now,
-            small: Duration::from_ticks(0),
-            large: Duration::from_ticks(0),
+            small,
+            large,
             edges: 0,
             coalesced: 0,
             last_edge: None,
@@ -570,7 +578,13 @@ mod tests {
     fn times_and_edges_add_up() {
         let mut recorder = EdgeRecorder::new(at(100), false);
         let start = recorder.history(at(100));
-        assert_eq!(start, RangeHistory::steady(at(100), Range::Small));
+        assert_eq!(
+            start,
+            RangeHistory {
+                small: Duration::from_ticks(0),
+                ..RangeHistory::steady(at(100), Range::Small)
+            }
+        );
         recorder.on_edge(at(150), true);
         recorder.on_edge(at(170), false);
         let history = recorder.history(at(200));

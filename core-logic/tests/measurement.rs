@@ -96,7 +96,11 @@ fn d0_switches_at_53_33_amps_in_both_directions_with_right_currents_on_both_side
                 // A conversion is the mean over its time; the current is linear but at the corners.
                 let now = board.world.current_a();
                 let length_s = (board.now_us - started_us) as f64 * 1e-6;
-                let code_a = if sent.range == Range::Small { 0.0163 } else { 0.163 };
+                let code_a = if sent.range == Range::Small {
+                    0.0163
+                } else {
+                    0.163
+                };
                 let error = f64::from(sent.current.get()) * 1e-6 - now;
                 assert!(
                     error.abs() < code_a + 200.0 * length_s,
@@ -131,7 +135,11 @@ fn d1_counts_the_charge_of_a_mixed_profile_within_the_error_budget() {
     let (error, bound) = (board.charge_error_c(), ideal_bound_c(&board, &rows));
     assert!(board.world.edges > 200, "{}", board.world.edges);
     assert!(error.abs() <= bound, "{error} C, bound {bound} C");
-    assert!(error.abs() < 1e-3 * board.world.charge_c, "{error} of {}", board.world.charge_c);
+    assert!(
+        error.abs() < 1e-3 * board.world.charge_c,
+        "{error} of {}",
+        board.world.charge_c
+    );
     assert!(board.measurement.charge().validity.is_valid());
 }
 
@@ -145,14 +153,20 @@ fn d2_zero_now_cancels_the_drift_of_both_channels() {
     board.vehicle.hv_feedback = false;
     assert!(board.run_until(|board| board.now_us > 3_000_000));
     let configuration = board.configuration;
-    assert_eq!(board.measurement.order(&configuration, Order::ZeroNow), Ok(()));
+    assert_eq!(
+        board.measurement.order(&configuration, Order::ZeroNow),
+        Ok(())
+    );
     assert_eq!(
         board.measurement.order(&configuration, Order::ZeroNow),
         Err(Refusal::Busy)
     );
     assert!(board.run_until(|board| board.configuration.zero_drift.value.small != Microamps::ZERO));
     let drift = board.configuration.zero_drift.value.small.get();
-    assert!((drift - 1_500_000).abs() < 8_200, "{drift} µA: half a code is 8.1 mA");
+    assert!(
+        (drift - 1_500_000).abs() < 8_200,
+        "{drift} µA: half a code is 8.1 mA"
+    );
     assert_eq!(board.configuration.zero_drift.value.large, Microamps::ZERO);
     let (begin_c, begin_s) = (
         board.meter.report().charge_total.get() as f64 * 1e-9,
@@ -194,19 +208,25 @@ fn d3_finds_the_open_small_sensor_and_marks_the_current() {
     assert!(board.measurement.current().validity.is_valid());
     board.network = Some(network_output_open());
     let opened_at = board.now_us;
-    assert!(board.run_until(|board| board
-        .measurement
-        .diagnosis()
-        .active()
-        .contains(Code::OpenSensor)));
-    assert!(board.now_us - opened_at <= 40_000, "{} µs", board.now_us - opened_at);
+    assert!(board.run_until(|board| {
+        board
+            .measurement
+            .diagnosis()
+            .active()
+            .contains(Code::OpenSensor)
+    }));
+    assert!(
+        board.now_us - opened_at <= 40_000,
+        "{} µs",
+        board.now_us - opened_at
+    );
     let sent = board.measurement.current();
     assert!(sent.validity.contains(Validity::OPEN));
     assert!(board.measurement.charge().validity.contains(Validity::OPEN));
     // The bus carries "not available", which is no current at all.
     let frame = sent.encode(0);
-    let raw = core_logic::can::layout::current::VALUE
-        .get(core_logic::can::layout::word(frame.data));
+    let raw =
+        core_logic::can::layout::current::VALUE.get(core_logic::can::layout::word(frame.data));
     assert_eq!(
         Some(raw),
         core_logic::can::layout::current::VALUE.not_available
@@ -234,7 +254,8 @@ fn d4_holds_the_permit_until_the_factors_are_taken_and_then_reads_zero() {
     let mut permitted_at = None;
     while let Some(step) = board.step() {
         if let Step::Tick(tick) = step {
-            let taken = board.measurement.board_state(0, 0).key_calibration == Some(KeyPhase::Taken);
+            let taken =
+                board.measurement.board_state(0, 0).key_calibration == Some(KeyPhase::Taken);
             permitted_before_taken |= tick.hv_permit && !taken;
             if taken && taken_at.is_none() {
                 taken_at = Some(board.now_us);
@@ -249,10 +270,21 @@ fn d4_holds_the_permit_until_the_factors_are_taken_and_then_reads_zero() {
     let delay_ms = (permitted_at.unwrap() - 3_000_000) / 1_000;
     assert!((500..1_500).contains(&delay_ms), "{delay_ms} ms");
     let factors = board.configuration.key_factors;
-    assert!((factors.a.get() - 10_000).abs() <= 610, "a = {:?}", factors.a);
-    assert!((factors.k_ppb - 1_004_016_064).abs() < 250_000, "k = {}", factors.k_ppb);
+    assert!(
+        (factors.a.get() - 10_000).abs() <= 610,
+        "a = {:?}",
+        factors.a
+    );
+    assert!(
+        (factors.k_ppb - 1_004_016_064).abs() < 250_000,
+        "k = {}",
+        factors.k_ppb
+    );
     let current = board.measurement.current().current.get();
-    assert!(current.abs() < 16_300, "{current} µA in ACC, one code is 16.3 mA");
+    assert!(
+        current.abs() < 16_300,
+        "{current} µA in ACC, one code is 16.3 mA"
+    );
 }
 
 /// D2 and D4: the state of charge follows the meter and is anchored after a rest.
@@ -276,7 +308,10 @@ fn soc_follows_the_charge_and_is_anchored_after_a_rest() {
     board.run();
     let left = board.measurement.state_of_charge().state_of_charge.get();
     // 36 A for 10 s out of 3,600 C are 10 %.
-    assert!((anchored - left - 100_000).abs() < 300, "{anchored} → {left}");
+    assert!(
+        (anchored - left - 100_000).abs() < 300,
+        "{anchored} → {left}"
+    );
 }
 
 /// A supply outside its limits invalidates everything that hangs on it, and says so.
@@ -290,8 +325,20 @@ fn a_bad_supply_is_reported_and_never_measured_with() {
         board.supply = supply;
         let until = board.now_us + 500_000;
         assert!(board.run_until(|board| board.now_us > until));
-        assert!(board.measurement.diagnosis().active().contains(Code::SupplyOutOfRange));
-        assert!(board.measurement.current().validity.contains(Validity::SUPPLY));
+        assert!(
+            board
+                .measurement
+                .diagnosis()
+                .active()
+                .contains(Code::SupplyOutOfRange)
+        );
+        assert!(
+            board
+                .measurement
+                .current()
+                .validity
+                .contains(Validity::SUPPLY)
+        );
         board.supply = Some(Microvolts::from_millivolts(5_000));
         let until = board.now_us + 1_500_000;
         assert!(board.run_until(|board| board.now_us > until));

@@ -112,10 +112,12 @@ impl<'a> HostBoard<'a> {
                     energy: self.energy,
                     at,
                 };
-                self.meter
-                    .on_reading(reading, self.edges.history(at));
-                self.measurement
-                    .on_meter(&self.configuration, &self.meter.report(), Validity::VALID);
+                self.meter.on_reading(reading, self.edges.history(at));
+                self.measurement.on_meter(
+                    &self.configuration,
+                    &self.meter.report(),
+                    Validity::VALID,
+                );
             }
             Event::Conversion {
                 started_us,

@@ -36,7 +36,11 @@ pub enum Event {
     /// AENERGY was read, 24 bit, sign extended.
     Energy { at_us: u64, counts: i32 },
     /// A conversion that began at `started_us` was read.
-    Conversion { started_us: u64, at_us: u64, code: i16 },
+    Conversion {
+        started_us: u64,
+        at_us: u64,
+        code: i16,
+    },
 }
 
 /// When the hardware is read, and how.
@@ -117,7 +121,10 @@ impl<'a> IdealBoard<'a> {
     }
 
     fn current_at(&self, t: f64) -> f64 {
-        let (a, b) = (self.rows[self.row], self.rows[(self.row + 1).min(self.rows.len() - 1)]);
+        let (a, b) = (
+            self.rows[self.row],
+            self.rows[(self.row + 1).min(self.rows.len() - 1)],
+        );
         if b.t_s <= a.t_s {
             return a.current_a;
         }
@@ -133,7 +140,13 @@ impl<'a> IdealBoard<'a> {
     /// First time in (t, end] at which the linear current reaches ±`level`, given it is not beyond already.
     fn crossing(&self, end: f64, level: f64, outwards: bool) -> Option<f64> {
         let (i0, i1) = (self.current_at(self.t), self.current_at(end));
-        let beyond = |i: f64| if outwards { i.abs() > level } else { i.abs() < level };
+        let beyond = |i: f64| {
+            if outwards {
+                i.abs() > level
+            } else {
+                i.abs() < level
+            }
+        };
         if beyond(i0) {
             return Some(self.t);
         }

@@ -1,0 +1,959 @@
+//! The composition's own work: what is known about the sensor enters the meter, orders and their outcomes, what goes out.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss
+)]
+
+use core_logic::can::BatteryVoltage;
+use core_logic::configuration::Configuration;
+use core_logic::converter::{ConverterSample, SupplyMode};
+use core_logic::design_parameters as design;
+use core_logic::diagnosis::{Code, CodeSet};
+use core_logic::front_end::{ClosedLoop, FrontEnd, Hah1bv, KeyFactors, Network, SupplyRelations};
+use core_logic::key_calibration::{KeyPhase, KeyState};
+use core_logic::measurement::{
+    ConverterFault, Environment, Found, Measurement, Order, Refusal, Tick, Vehicle,
+    effective_meter_config,
+};
+use core_logic::meter::{GapBridge, MeterChannel, MeterReading, MeterReport};
+use core_logic::modbus::readings::CommandState;
+use core_logic::modbus::{Activity, Readings};
+use core_logic::open_sensor::{network_output, network_output_open};
+use core_logic::range::{Range, RangeHistory};
+use core_logic::units::{
+    Duration, Instant, Microamps, Microvolts, MilliCelsius, Millivolts, Nanocoulombs, Ppm,
+};
+use core_logic::validity::Validity;
+use proptest::prelude::*;
+
+const PERIOD_US: u64 = 31_250;
+
+/// The measuring logic alone, fed by hand.
+struct Bench {
+    configuration: Configuration,
+    measurement: Measurement,
+    now: u64,
+    next_conversion: u64,
+    next_tick: u64,
+    code: i16,
+    range: Range,
+    vehicle: Vehicle,
+    environment: Environment,
+    report: MeterReport,
+    tick: Option<Tick>,
+}
+
+impl Bench {
+    fn new(configuration: Configuration) -> Self {
+        let start = Instant::from_ticks(0);
+        Self {
+            measurement: Measurement::new(&configuration, None, Nanocoulombs::ZERO, start),
+            configuration,
+            now: 0,
+            next_conversion: PERIOD_US,
+            next_tick: 0,
+            code: 4_096,
+            range: Range::Small,
+            vehicle: Vehicle {
+                state_fresh: true,
+                voltage_fresh: true,
+                ..Vehicle::default()
+            },
+            environment: Environment {
+                supply: Some(Microvolts::from_millivolts(5_000)),
+                network: Some(network_output(Microvolts::from_millivolts(2_500))),
+                sensor_temperature: Some(MilliCelsius(25_000)),
+                board_temperature: Some(MilliCelsius(30_000)),
+                controller_supply: Some(Millivolts(3_300)),
+            },
+            report: MeterReport {
+                mean_over: Duration::from_ticks(1_000_000),
+                ..MeterReport::default()
+            },
+            tick: None,
+        }
+    }
+
+    fn history(&self) -> RangeHistory {
+        RangeHistory::steady(Instant::from_ticks(self.now), self.range)
+    }
+
+    /// Ticks, conversions and meter reports for so long.
+    fn run_ms(&mut self, milliseconds: u64) {
+        let end = self.now + milliseconds * 1_000;
+        while self.next_tick.min(self.next_conversion) <= end {
+            let history = |bench: &Self| bench.history();
+            if self.next_conversion < self.next_tick {
+                self.now = self.next_conversion;
+                self.next_conversion += PERIOD_US;
+                let sample = ConverterSample {
+                    started: Instant::from_ticks(self.now - PERIOD_US),
+                    finished: Instant::from_ticks(self.now),
+                    configuration: self.configuration.converter.expected_configuration(),
+                    code: self.code,
+                };
+                let seen = history(self);
+                self.measurement
+                    .on_conversion(&self.configuration, &sample, &seen);
+            } else {
+                self.now = self.next_tick;
+                self.next_tick += 10_000;
+                let seen = history(self);
+                let now = Instant::from_ticks(self.now);
+                self.measurement
+                    .on_environment(&self.configuration, self.environment, &seen, now);
+                self.report.at = Some(now);
+                self.report.mean_begun = now;
+                self.measurement
+                    .on_meter(&self.configuration, &self.report, Validity::VALID);
+                let tick = self.measurement.tick(
+                    &self.configuration,
+                    now,
+                    &self.vehicle,
+                    &seen,
+                    CodeSet::EMPTY,
+                );
+                if let Some(found) = tick.found {
+                    found.store(&mut self.configuration);
+                    self.measurement.configuration_changed(&self.configuration);
+                }
+                self.tick = Some(tick);
+            }
+        }
+        self.now = end;
+    }
+
+    fn order(&mut self, order: Order) -> Result<(), Refusal> {
+        self.measurement.order(&self.configuration, order)
+    }
+
+    fn readings(&self) -> Readings {
+        let mut readings = Readings::default();
+        self.measurement.fill(&self.configuration, &mut readings);
+        readings
+    }
+
+    fn has(&self, code: Code) -> bool {
+        self.measurement.diagnosis().active().contains(code)
+    }
+}
+
+fn closed_loop() -> ClosedLoop {
+    ClosedLoop {
+        relations: SupplyRelations {
+            k2_nanovolt_per_volt: 498_000_000,
+            m2_nanovolt: 11_000_000,
+            ..SupplyRelations::default()
+        },
+        ..ClosedLoop::default()
+    }
+}
+
+fn with_front_end(front_end: FrontEnd) -> Configuration {
+    let mut configuration = Configuration {
+        front_end,
+        ..Configuration::default()
+    };
+    configuration.derive();
+    configuration
+}
+
+/// Counts per second that the meter makes for a voltage at the switch's output and a level shift, both in volts.
+fn counts_per_second(signal_v: f64, shift_v: f64) -> f64 {
+    let full_scale = design::METER_COUNTS_PER_SECOND_Q32 as f64 / 2f64.powi(32);
+    full_scale * (signal_v - shift_v) * (2.0 / 9.0) / 0.5
+}
+
+proptest! {
+    /// Whatever is known about the sensor - drift, key factors, supply - the meter's charge is what flowed.
+    #[test]
+    fn the_meter_counts_with_everything_that_is_known_about_the_sensor(
+        kind in 0..3,
+        supply_v in 4.6f64..5.4,
+        current_a in -50.0f64..50.0,
+        drift_a in -3.0f64..3.0,
+        k in 0.99f64..1.01,
+        a_v in -0.03f64..0.03,
+        large: bool,
+    ) {
+        let front_end = match kind {
+            0 => FrontEnd::default(),
+            1 => FrontEnd::Hah1bv(Hah1bv::default()),
+            _ => FrontEnd::ClosedLoop(closed_loop()),
+        };
+        let mut configuration = with_front_end(front_end);
+        let range = if large && kind == 0 { Range::Large } else { Range::Small };
+        configuration.zero_drift.value.set(range, Microamps((drift_a * 1e6) as i32));
+        let factors = KeyFactors {
+            k_ppb: (k * 1e9) as i32,
+            a: Microvolts((a_v * 1e6) as i32),
+        };
+        let config = effective_meter_config(
+            &configuration,
+            factors,
+            Some(Microvolts((supply_v * 1e6) as i32)),
+        );
+        // The sensor as D4 describes it: k·(V + a) is the ideal output for the current and the drift.
+        let sensed = current_a + drift_a;
+        let (k, a_v) = if range == Range::Small { (k, a_v) } else { (1.0, 0.0) };
+        let output_v = match kind {
+            0 | 1 => {
+                let per_amp = match (kind, range) {
+                    (0, Range::Small) => 2.25 / 60.0,
+                    (0, Range::Large) => 2.25 / 600.0,
+                    _ => 0.004,
+                };
+                ((2.5 + sensed * per_amp) / k - a_v) * supply_v / 5.0
+            }
+            _ => {
+                let relations = closed_loop().relations;
+                let impedance = (relations.k1_nanoohm_per_volt as f64 * supply_v
+                    + relations.m1_nanoohm as f64) * 1e-9;
+                let zero = (relations.k2_nanovolt_per_volt as f64 * supply_v
+                    + relations.m2_nanovolt as f64) * 1e-9;
+                (impedance * sensed / f64::from(closed_loop().turns) + zero) / k - a_v
+            }
+        };
+        let rate = counts_per_second(output_v, supply_v / 2.0);
+        let mut channel = MeterChannel::new(config);
+        for second in 0..=100u64 {
+            let us = second * 1_000_000;
+            let energy = (rate * second as f64).floor() as i32;
+            let at = Instant::from_ticks(us);
+            channel.on_reading(MeterReading { energy, at }, RangeHistory::steady(at, range));
+        }
+        let charge = channel.report().charge_total.get() as f64 * 1e-9;
+        // One count; 3 ppm of rounded factors of what the meter sees; 1 µV of rounding at the sensor's output.
+        let count_c = config.charge_per_count(range).get() as f64 * 1e-9;
+        let full_a = f64::from(config.full_scale.get(range).get()) * 1e-6;
+        let bound = count_c + 100.0 * (3e-6 * 2.0 * full_a + 2e-6 * full_a / 2.25);
+        prop_assert!(
+            (charge - 100.0 * current_a).abs() <= bound,
+            "{charge} C of {} C, bound {bound} C", 100.0 * current_a
+        );
+    }
+}
+
+#[test]
+fn a_fixed_or_unknown_supply_leaves_the_meter_as_it_is() {
+    let mut configuration = Configuration::default();
+    let nominal = effective_meter_config(&configuration, KeyFactors::NONE, None);
+    assert_eq!(nominal, configuration.meter);
+    configuration.converter.supply_mode = SupplyMode::Fixed;
+    let supply = Some(Microvolts::from_millivolts(4_700));
+    assert_eq!(
+        effective_meter_config(&configuration, KeyFactors::NONE, supply),
+        configuration.meter
+    );
+    configuration.converter.supply_mode = SupplyMode::Ratiometric;
+    let measured = effective_meter_config(&configuration, KeyFactors::NONE, supply);
+    // 5 / 4.7
+    assert_eq!(measured.gain.small, Ppm(63_830));
+    let network = with_front_end(FrontEnd::Network(Network::default()));
+    assert_eq!(
+        effective_meter_config(&network, KeyFactors::NONE, supply),
+        network.meter
+    );
+}
+
+/// D2's single sensor and D3's network as the front end in use.
+#[test]
+fn every_front_end_measures() {
+    let mut bench = Bench::new(with_front_end(FrontEnd::Hah1bv(Hah1bv::default())));
+    // 2.9 V are 100 A: 2.9 / 5 · 8192 = 4751.4.
+    bench.code = 4_751;
+    bench.range = Range::Large; // a flag without a meaning here
+    bench.run_ms(500);
+    let sent = bench.measurement.current();
+    assert!(sent.validity.is_valid(), "{:?}", sent.validity);
+    assert!(
+        (sent.current.get() - 100_000_000).abs() < 153_000,
+        "{:?}",
+        sent.current
+    );
+    assert_eq!(sent.range, Range::Small);
+
+    let mut bench = Bench::new(with_front_end(FrontEnd::Network(Network::default())));
+    // ±4 V at ±500 A: 100 A are 0.8 V, behind the network 1.83 V.
+    bench.environment.network = Some(network_output(Microvolts::from_millivolts(800)));
+    bench.run_ms(500);
+    let sent = bench.measurement.current();
+    assert!(sent.validity.is_valid(), "{:?}", sent.validity);
+    assert!(
+        (sent.current.get() - 100_000_000).abs() < 1_000,
+        "{:?}",
+        sent.current
+    );
+    // The other converter's troubles are none of its.
+    let now = Instant::from_ticks(bench.now);
+    bench
+        .measurement
+        .on_converter_fault(ConverterFault::NoAnswer, now);
+    bench.run_ms(500);
+    assert!(bench.measurement.current().validity.is_valid());
+    assert!(!bench.has(Code::ConverterNoAnswer));
+    bench.environment.network = Some(network_output_open());
+    bench.run_ms(100);
+    assert!(bench.has(Code::OpenSensor));
+    assert!(
+        bench
+            .measurement
+            .current()
+            .validity
+            .contains(Validity::OPEN)
+    );
+}
+
+#[test]
+fn a_closed_loop_sensor_without_relations_says_so() {
+    let mut bench = Bench::new(with_front_end(FrontEnd::ClosedLoop(ClosedLoop::default())));
+    bench.run_ms(500);
+    assert!(bench.has(Code::SupplyCalibrationInvalid));
+    let mut bench = Bench::new(with_front_end(FrontEnd::ClosedLoop(closed_loop())));
+    bench.run_ms(500);
+    assert!(!bench.has(Code::SupplyCalibrationInvalid));
+}
+
+/// D4 by order of a host: points over the supply at 0 A and at the test current, then the relations.
+#[test]
+fn a_supply_sweep_by_orders_gives_the_relations() {
+    let truth = closed_loop();
+    let mut configuration = with_front_end(FrontEnd::ClosedLoop(ClosedLoop::default()));
+    configuration.supply_test_current = Microamps::from_amps(200);
+    configuration.converter.supply_mode = SupplyMode::Measured;
+    configuration.converter.data_rate = core_logic::converter::DataRate::Sps8;
+    configuration.key_calibration.enabled = false;
+    let mut bench = Bench::new(configuration);
+    assert_eq!(
+        bench.order(Order::FinishSupplyCalibration),
+        Err(Refusal::SupplyCalibration)
+    );
+    assert_eq!(
+        bench.order(Order::SupplyPointAtZero),
+        Err(Refusal::SupplyUnknown)
+    );
+    for (amps, order) in [
+        (0, Order::SupplyPointAtZero),
+        (200, Order::SupplyPointAtCurrent),
+    ] {
+        for millivolts in [4_550, 4_700, 4_850, 5_000, 5_150, 5_300, 5_450] {
+            let supply = Microvolts::from_millivolts(millivolts);
+            bench.environment.supply = Some(supply);
+            let output = FrontEnd::ClosedLoop(truth).voltage(
+                Microamps::from_amps(amps),
+                Range::Small,
+                supply,
+            );
+            bench.code = (f64::from(output.get()) * 1e-6 / 5.0 * 32_768.0).round() as i16;
+            bench.run_ms(1_500);
+            assert_eq!(bench.order(order), Ok(()), "{millivolts} mV");
+        }
+    }
+    assert_eq!(bench.readings().supply_points, [7, 7]);
+    assert_eq!(bench.readings().activity, Activity::SupplyCalibration);
+    assert!(
+        bench
+            .measurement
+            .current()
+            .validity
+            .contains(Validity::CALIBRATING)
+    );
+    assert_eq!(bench.order(Order::ZeroNow), Err(Refusal::Busy));
+    assert_eq!(bench.order(Order::FinishSupplyCalibration), Ok(()));
+    bench.run_ms(20);
+    let FrontEnd::ClosedLoop(found) = bench.configuration.front_end else {
+        panic!("the front end is another one");
+    };
+    // Seven points over 0.9 V, each within half a code of 153 µV: 0.2 mV/V at most.
+    let close = |a: i64, b: i64, within: i64| assert!((a - b).abs() < within, "{a} {b}");
+    close(
+        found.relations.k2_nanovolt_per_volt,
+        truth.relations.k2_nanovolt_per_volt,
+        200_000,
+    );
+    close(
+        found.relations.m2_nanovolt,
+        truth.relations.m2_nanovolt,
+        1_000_000,
+    );
+    let referred =
+        |relations: SupplyRelations| relations.impedance_nanoohm(design::SENSOR_NOMINAL_SUPPLY);
+    let (got, expected) = (referred(found.relations), referred(truth.relations));
+    close(got, expected, expected / 500);
+    assert_eq!(bench.readings().command_state, CommandState::Done);
+    assert_eq!(bench.readings().activity, Activity::None);
+
+    // A point of an invalid reading, and an aborted sweep.
+    assert_eq!(bench.order(Order::SupplyPointAtZero), Ok(()));
+    assert_eq!(bench.order(Order::Abort), Ok(()));
+    assert_eq!(bench.readings().command_state, CommandState::Failed);
+    assert_eq!(bench.order(Order::Abort), Ok(()));
+    assert_eq!(bench.readings().command_state, CommandState::Done);
+    bench
+        .measurement
+        .on_converter_fault(ConverterFault::NoAnswer, Instant::from_ticks(bench.now));
+    assert_eq!(
+        bench.order(Order::SupplyPointAtZero),
+        Err(Refusal::InvalidReading)
+    );
+}
+
+#[test]
+fn orders_are_refused_with_their_reason_where_they_make_no_sense() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(1_500);
+    for order in [
+        Order::SupplyPointAtZero,
+        Order::SupplyPointAtCurrent,
+        Order::FinishSupplyCalibration,
+    ] {
+        assert_eq!(bench.order(order), Err(Refusal::NotForThisFrontEnd));
+        let readings = bench.readings();
+        assert_eq!(
+            (readings.command_state, readings.command_reason),
+            (CommandState::Failed, Refusal::NotForThisFrontEnd as u16)
+        );
+    }
+    bench.measurement.note_command(CommandState::Done, 3);
+    assert_eq!(bench.readings().command_reason, 3);
+
+    bench.vehicle.hv_feedback = true;
+    bench.run_ms(10);
+    assert_eq!(
+        bench.order(Order::KeyCalibration),
+        Err(Refusal::HighVoltage)
+    );
+    assert_eq!(bench.order(Order::ZeroNow), Err(Refusal::HighVoltage));
+    bench.vehicle.hv_feedback = false;
+    bench.run_ms(10);
+    assert_eq!(bench.order(Order::KeyCalibration), Ok(()));
+    bench.configuration.key_calibration.enabled = false;
+    assert_eq!(bench.order(Order::KeyCalibration), Err(Refusal::Disabled));
+    bench.configuration.key_calibration.enabled = true;
+    bench.vehicle.acc_line = true;
+    bench.run_ms(200);
+    assert_eq!(bench.readings().activity, Activity::KeyCalibration);
+    assert_eq!(bench.readings().key_calibration_state, 1);
+    assert!(
+        bench
+            .measurement
+            .current()
+            .validity
+            .contains(Validity::CALIBRATING)
+    );
+    assert_eq!(bench.order(Order::KeyCalibration), Err(Refusal::KeyNotOff));
+}
+
+#[test]
+fn a_zero_calibration_reports_progress_ends_and_can_be_aborted() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(1_500);
+    bench.code = 4_100; // 65 mA
+    bench.run_ms(500);
+    assert_eq!(bench.order(Order::ZeroNow), Ok(()));
+    bench.run_ms(1_000);
+    let readings = bench.readings();
+    assert_eq!(readings.activity, Activity::ZeroDrift);
+    assert!(
+        (40..=55).contains(&readings.activity_progress),
+        "{}",
+        readings.activity_progress
+    );
+    assert_eq!(readings.command_state, CommandState::Running);
+    assert_eq!(bench.order(Order::Abort), Ok(()));
+    assert_eq!(bench.readings().activity, Activity::None);
+    assert_eq!(bench.order(Order::ZeroNow), Ok(()));
+    bench.run_ms(3_000);
+    assert_eq!(bench.readings().command_state, CommandState::Done);
+    assert_eq!(
+        bench.configuration.zero_drift.value.small,
+        Microamps(65_104)
+    );
+    assert_eq!(bench.measurement.current().current, Microamps(0));
+
+    // Beyond the limit: refused, reported, the previous value stays.
+    bench.code = 4_600; // 8.2 A
+    bench.run_ms(500);
+    assert_eq!(bench.order(Order::ZeroNow), Ok(()));
+    bench.run_ms(4_000);
+    assert_eq!(bench.readings().command_reason, Refusal::BeyondLimit as u16);
+    assert!(bench.has(Code::ZeroDriftBeyondLimit));
+    assert_eq!(
+        bench.configuration.zero_drift.value.small,
+        Microamps(65_104)
+    );
+
+    // Nothing arrives: it ends by itself.
+    bench.code = 4_100;
+    bench.run_ms(500);
+    assert_eq!(bench.order(Order::ZeroNow), Ok(()));
+    bench.next_conversion = u64::MAX;
+    bench.run_ms(u64::from(bench.configuration.zero_drift.timeout_ms) + 100);
+    assert_eq!(bench.readings().command_reason, Refusal::Timeout as u16);
+}
+
+#[test]
+fn every_reason_against_a_zero_has_its_number() {
+    use core_logic::zero_drift::ZeroRefusal as Zero;
+    let microamps = Microamps(1);
+    for (zero, number) in [
+        (Zero::Busy, 1),
+        (Zero::HighVoltage, 2),
+        (Zero::CurrentFlows { mean: microamps }, 3),
+        (Zero::MeterUnknown, 4),
+        (Zero::InvalidReading, 5),
+        (Zero::Unstable { spread: microamps }, 6),
+        (
+            Zero::BeyondLimit {
+                value: microamps,
+                limit: microamps,
+            },
+            7,
+        ),
+        (Zero::Timeout, 8),
+        (Zero::Cancelled, 9),
+    ] {
+        assert_eq!(Refusal::from(zero) as u16, number);
+    }
+}
+
+#[test]
+fn faults_of_the_converter_are_named_and_pass_with_the_next_sample() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(1_000);
+    let good = bench.measurement.current();
+    assert!(good.validity.is_valid());
+    bench.next_conversion = u64::MAX;
+    let now = Instant::from_ticks(bench.now);
+    bench
+        .measurement
+        .on_converter_fault(ConverterFault::NoAnswer, now);
+    assert!(
+        bench
+            .measurement
+            .current()
+            .validity
+            .contains(Validity::CHIP_FAULT)
+    );
+    bench.run_ms(200);
+    assert!(bench.has(Code::ConverterNoAnswer) && bench.has(Code::ConverterStale));
+    assert!(
+        bench
+            .measurement
+            .current()
+            .validity
+            .contains(Validity::STALE)
+    );
+    assert_eq!(bench.measurement.current().current, good.current);
+    assert_eq!(
+        bench.measurement.bridge(&bench.configuration),
+        GapBridge::Unknown
+    );
+    bench
+        .measurement
+        .on_converter_fault(ConverterFault::ConfigurationLost, now);
+    bench.run_ms(20);
+    assert!(bench.has(Code::ConverterConfigurationLost));
+    bench.next_conversion = bench.now;
+    bench.run_ms(2_000);
+    assert!(!bench.has(Code::ConverterNoAnswer) && !bench.has(Code::ConverterConfigurationLost));
+    assert!(bench.measurement.current().validity.is_valid());
+    assert_eq!(
+        bench.measurement.bridge(&bench.configuration),
+        GapBridge::MeanCurrent(good.current)
+    );
+    // A sample with the power-up configuration byte.
+    let invalid = bench.measurement.invalid_conversions();
+    let sample = ConverterSample {
+        started: Instant::from_ticks(bench.now + 1),
+        finished: Instant::from_ticks(bench.now + 2),
+        configuration: 0x8C,
+        code: 0,
+    };
+    let history = bench.history();
+    bench
+        .measurement
+        .on_conversion(&bench.configuration, &sample, &history);
+    assert_eq!(bench.measurement.invalid_conversions(), invalid + 1);
+    assert!(
+        bench
+            .measurement
+            .current()
+            .validity
+            .contains(Validity::CHIP_FAULT)
+    );
+    assert_eq!(
+        bench.measurement.current().current,
+        good.current,
+        "never 0 A, never −60 A"
+    );
+}
+
+#[test]
+fn the_meters_state_is_the_charges_validity() {
+    let mut bench = Bench::new(Configuration::default());
+    assert!(
+        bench
+            .measurement
+            .charge()
+            .validity
+            .contains(Validity::STALE)
+    );
+    bench.run_ms(100);
+    assert!(bench.measurement.charge().validity.is_valid());
+    assert!(!bench.measurement.charge().estimated);
+    for (report, validity, estimated) in [
+        (
+            MeterReport {
+                lost: true,
+                ..bench.report
+            },
+            Validity::CHIP_FAULT,
+            false,
+        ),
+        (
+            MeterReport {
+                gaps: 1,
+                ..bench.report
+            },
+            Validity::VALID,
+            true,
+        ),
+        (
+            MeterReport {
+                estimated_intervals: 1,
+                ..bench.report
+            },
+            Validity::VALID,
+            true,
+        ),
+    ] {
+        bench
+            .measurement
+            .on_meter(&bench.configuration, &report, Validity::VALID);
+        assert_eq!(bench.measurement.charge().validity, validity);
+        assert_eq!(bench.measurement.charge().estimated, estimated);
+    }
+    bench.measurement.on_meter(
+        &bench.configuration,
+        &MeterReport {
+            mean_over: Duration::from_ticks(0),
+            below_no_load: true,
+            ..bench.report
+        },
+        Validity::CALIBRATING,
+    );
+    let sent = bench.measurement.meter_current();
+    assert_eq!(sent.validity, Validity::CALIBRATING.and(Validity::STALE));
+    assert!(sent.below_no_load);
+}
+
+#[test]
+fn what_is_kept_over_a_reset_goes_on() {
+    let configuration = Configuration::default();
+    let mut bench = Bench::new(configuration);
+    bench
+        .measurement
+        .set_state_of_charge(Ppm(700_000), Ppm(20_000));
+    bench.report.charge_total = Nanocoulombs::from_coulombs(1_234);
+    bench.run_ms(100);
+    let kept = bench.measurement.retained(7);
+    assert_eq!(kept.sequence, 7);
+    assert_eq!(kept.charge_total, Nanocoulombs::from_coulombs(1_234));
+    let start = Instant::from_ticks(0);
+    let clean = Measurement::new(&configuration, Some(&kept), Nanocoulombs::ZERO, start);
+    assert_eq!(clean.charge().charge, Nanocoulombs::from_coulombs(1_234));
+    assert!(!clean.charge().estimated);
+    let before = bench.measurement.state_of_charge();
+    assert_eq!(
+        clean.state_of_charge().state_of_charge,
+        before.state_of_charge
+    );
+    // A tenth of the capacity may be lost: said, and added to the uncertainty.
+    let lost = Nanocoulombs::from_milliamp_hours(i64::from(configuration.soc.capacity_mah) / 10);
+    let mut lossy = Measurement::new(&configuration, Some(&kept), lost, start);
+    assert!(lossy.charge().estimated);
+    let grown =
+        lossy.state_of_charge().uncertainty.unwrap().get() - before.uncertainty.unwrap().get();
+    assert!((grown - 100_000).abs() < 10, "{grown}");
+    let history = RangeHistory::steady(start, Range::Small);
+    let tick = lossy.tick(
+        &configuration,
+        start,
+        &Vehicle::default(),
+        &history,
+        CodeSet::EMPTY,
+    );
+    assert!(tick.changes.set.contains(Code::ChargeRestoredWithLoss));
+    // Nothing kept: the state of charge is not known, and not sent as a number.
+    let fresh = Measurement::new(&configuration, None, Nanocoulombs::ZERO, start);
+    assert!(fresh.state_of_charge().validity.contains(Validity::STALE));
+    assert_eq!(fresh.state_of_charge().uncertainty, None);
+    assert_eq!(fresh.state_of_charge().remaining, None);
+}
+
+#[test]
+fn another_capacity_keeps_the_state_of_charge() {
+    let mut bench = Bench::new(Configuration::default());
+    bench
+        .measurement
+        .set_state_of_charge(Ppm(400_000), Ppm(20_000));
+    bench.configuration.soc.capacity_mah /= 2;
+    bench
+        .measurement
+        .configuration_changed(&bench.configuration);
+    bench.run_ms(20);
+    let soc = bench.measurement.state_of_charge();
+    assert!((soc.state_of_charge.get() - 400_000).abs() <= 1);
+    let half = Nanocoulombs::from_milliamp_hours(i64::from(bench.configuration.soc.capacity_mah));
+    assert!((soc.remaining.unwrap().get() - half.get() * 2 / 5).abs() < 1_000_000);
+}
+
+#[test]
+fn surroundings_are_sent_with_their_validity() {
+    let mut bench = Bench::new(Configuration::default());
+    assert!(
+        bench
+            .measurement
+            .environment()
+            .supply_validity
+            .contains(Validity::STALE)
+    );
+    bench.run_ms(500);
+    let sent = bench.measurement.environment();
+    assert_eq!(sent.supply, Millivolts(5_000));
+    assert_eq!(sent.sensor_temperature, MilliCelsius(25_000));
+    assert_eq!(sent.board_temperature, MilliCelsius(30_000));
+    assert!(sent.supply_validity.is_valid() && sent.sensor_temperature_validity.is_valid());
+    bench.environment.sensor_temperature = None;
+    bench.environment.board_temperature = Some(MilliCelsius(105_001));
+    bench.run_ms(1_500);
+    let sent = bench.measurement.environment();
+    assert!(sent.sensor_temperature_validity.contains(Validity::STALE));
+    assert!(sent.board_temperature_validity.is_valid());
+    assert!(bench.has(Code::TemperatureOutOfRange));
+    bench.environment.board_temperature = Some(MilliCelsius(-40_000));
+    bench.environment.sensor_temperature = Some(MilliCelsius(-40_000));
+    bench.run_ms(6_000);
+    assert!(!bench.has(Code::TemperatureOutOfRange));
+    bench.environment.sensor_temperature = Some(MilliCelsius(-40_001));
+    bench.run_ms(1_500);
+    assert!(bench.has(Code::TemperatureOutOfRange));
+    // A supply that jumps is believed at once, one that wanders is averaged.
+    bench.environment.supply = Some(Microvolts::from_millivolts(5_400));
+    bench.run_ms(10);
+    assert!(bench.measurement.environment().supply < Millivolts(5_100));
+    bench.run_ms(1_000);
+    // Factors are worked out anew per millivolt.
+    let supply = bench.measurement.environment().supply;
+    assert!(
+        (Millivolts(5_399)..=Millivolts(5_400)).contains(&supply),
+        "{supply:?}"
+    );
+    bench.environment.supply = Some(Microvolts::from_millivolts(4_600));
+    bench.run_ms(10);
+    assert_eq!(bench.measurement.environment().supply, Millivolts(4_600));
+}
+
+#[test]
+fn the_large_sensor_goes_on_when_the_small_one_is_open() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(500);
+    bench.range = Range::Large;
+    bench.code = 4_096 + 1_475; // 240 A by the large sensor
+    bench.environment.network = Some(network_output_open());
+    bench.run_ms(500);
+    assert!(bench.has(Code::SmallSensorOpen) && !bench.has(Code::OpenSensor));
+    let sent = bench.measurement.current();
+    assert!(sent.validity.is_valid(), "{:?}", sent.validity);
+    assert!((sent.current.get() - 240_000_000).abs() < 200_000);
+    // The large sensor at its rail: nothing is left to measure with.
+    bench.code = 100;
+    bench.run_ms(200);
+    assert!(bench.has(Code::SensorRail));
+    assert!(
+        bench
+            .measurement
+            .current()
+            .validity
+            .contains(Validity::OPEN)
+    );
+}
+
+#[test]
+fn a_flag_that_contradicts_the_level_is_reported_and_chatter_too() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(500);
+    // Flag high, the large sensor at 10 A, and the small one agrees with it.
+    bench.range = Range::Large;
+    bench.code = 4_096 + 61;
+    bench.environment.network = Some(network_output(Microvolts(2_500_000 + 375_000)));
+    bench.run_ms(300);
+    assert!(bench.has(Code::FlagImplausible));
+    assert!(
+        bench
+            .measurement
+            .current()
+            .validity
+            .contains(Validity::IMPLAUSIBLE)
+    );
+}
+
+#[test]
+fn readings_and_log_carry_what_is_on_the_bus() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.code = 4_200;
+    bench.report.charge_total = Nanocoulombs::from_coulombs(55);
+    bench.report.charge_in = Nanocoulombs::from_coulombs(5);
+    bench.report.charge_out = Nanocoulombs::from_coulombs(60);
+    bench.report.mean_current = Microamps(1_692_000);
+    bench.report.uncertainty = Nanocoulombs(77);
+    bench.report.estimated_intervals = 3;
+    bench
+        .measurement
+        .set_state_of_charge(Ppm(500_000), Ppm(10_000));
+    bench.vehicle.can_key = Some(KeyState::Off);
+    bench.measurement.on_battery_voltage(
+        &BatteryVoltage {
+            cell: Some(Microvolts(3_712_345)),
+            pack: Some(Millivolts(371_000)),
+            cell_temperature: None,
+        },
+        Instant::from_ticks(0),
+    );
+    bench.run_ms(995);
+    let readings = bench.readings();
+    let current = bench.measurement.current();
+    let average = bench.measurement.current_average(&bench.configuration);
+    assert_eq!(readings.current, current.current);
+    assert_eq!(current.current, Microamps(1_692_708));
+    assert_eq!(readings.current_average, average.average);
+    assert_eq!(
+        (average.samples, average.span),
+        (8, Duration::from_ticks(7 * PERIOD_US))
+    );
+    assert_eq!(readings.conversions, current.conversions);
+    assert_eq!(current.conversions, 31);
+    assert_eq!(current.age, Some(Duration::from_ticks(990_000 - 968_750)));
+    assert_eq!(readings.charge, Nanocoulombs::from_coulombs(55));
+    assert_eq!(readings.charge_in, Nanocoulombs::from_coulombs(5));
+    assert_eq!(readings.charge_out, Nanocoulombs::from_coulombs(60));
+    assert_eq!(readings.charge_uncertainty, Nanocoulombs(77));
+    assert_eq!(readings.meter_current, Microamps(1_692_000));
+    assert_eq!(readings.estimated_intervals, 3);
+    assert_eq!(readings.sensor_voltage, Microvolts(2_563_477));
+    assert_eq!(readings.cell_voltage, Millivolts(3_712));
+    assert_eq!(readings.pack_voltage, Millivolts(371_000));
+    assert_eq!(readings.supply, Microvolts::from_millivolts(5_000));
+    assert_eq!(readings.mcu_supply, Millivolts(3_300));
+    assert_eq!(readings.sensor_temperature, MilliCelsius(25_000));
+    assert_eq!(readings.board_temperature, MilliCelsius(30_000));
+    assert_eq!(
+        readings.network_voltage,
+        network_output(Microvolts(2_500_000))
+    );
+    assert_eq!(readings.key_state, KeyState::Off as u16);
+    assert!(!readings.high_voltage_on && !readings.high_voltage_permit);
+    assert_eq!(
+        readings.diagnoses_active,
+        bench.measurement.diagnosis().active().bits()
+    );
+    assert_eq!(
+        readings.diagnoses_latched,
+        bench.measurement.diagnosis().latched().bits()
+    );
+    let soc = bench.measurement.state_of_charge();
+    assert_eq!(readings.soc, soc.state_of_charge);
+    assert_eq!(Some(readings.soc_uncertainty), soc.uncertainty);
+    assert_eq!(Some(readings.remaining_charge), soc.remaining);
+    assert!(readings.cell_validity.is_valid());
+    bench.vehicle.voltage_fresh = false;
+    bench.run_ms(20);
+    assert_eq!(bench.readings().cell_validity, Validity::STALE);
+
+    let record = bench.measurement.log_record(&bench.configuration, 9);
+    assert_eq!(record.boot, 9);
+    assert_eq!(record.uptime_ms, 1_010);
+    assert_eq!(record.current, average.average);
+    assert_eq!(record.charge, readings.charge);
+    assert_eq!(record.soc, readings.soc);
+    assert_eq!(record.supply, Millivolts(5_000));
+    assert_eq!(record.temperature, MilliCelsius(25_000));
+    assert_eq!(
+        record.diagnoses,
+        bench.measurement.diagnosis().reported().bits()
+    );
+
+    let state = bench.measurement.board_state(4, 5);
+    assert_eq!((state.bus_offs, state.refused), (4, 5));
+    assert_eq!(state.key, Some(KeyState::Off));
+    assert_eq!(state.key_calibration, Some(KeyPhase::Off));
+    assert_eq!(state.high_voltage, Some(false));
+    bench.report.charge_total = Nanocoulombs::from_coulombs(65);
+    bench.run_ms(20);
+    let through = bench.measurement.throughput();
+    assert_eq!(through.discharged, Nanocoulombs::from_coulombs(10));
+    assert_eq!(through.charged, Nanocoulombs::ZERO);
+}
+
+#[test]
+fn what_a_calibration_finds_goes_where_it_belongs() {
+    let mut configuration = Configuration::default();
+    Found::ZeroDrift(Range::Large, Microamps(5)).store(&mut configuration);
+    assert_eq!(configuration.zero_drift.value.large, Microamps(5));
+    assert_eq!(configuration.zero_drift.value.small, Microamps(0));
+    let factors = KeyFactors {
+        k_ppb: 1,
+        a: Microvolts(2),
+    };
+    Found::KeyFactors(factors).store(&mut configuration);
+    assert_eq!(configuration.key_factors, factors);
+    let before = configuration;
+    let relations = closed_loop().relations;
+    Found::SupplyRelations(relations).store(&mut configuration);
+    assert_eq!(
+        configuration, before,
+        "the dual-range sensor has no such relations"
+    );
+    configuration.front_end = FrontEnd::ClosedLoop(ClosedLoop::default());
+    Found::SupplyRelations(relations).store(&mut configuration);
+    assert_eq!(configuration.front_end, FrontEnd::ClosedLoop(closed_loop()));
+}
+
+#[test]
+fn missing_messages_and_the_key_without_samples_are_reported() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.vehicle.state_fresh = false;
+    bench.vehicle.voltage_fresh = false;
+    bench.run_ms(6_000);
+    assert!(bench.has(Code::VehicleStateMissing) && bench.has(Code::CellVoltageMissing));
+    // The key turned at once: no output was taken with key OFF.
+    let mut bench = Bench::new(Configuration::default());
+    bench.vehicle.acc_line = true;
+    bench.run_ms(3_000);
+    assert_eq!(bench.readings().key_calibration_state, 3);
+    assert!(
+        bench.tick.unwrap().hv_permit,
+        "permitted with the previous factors"
+    );
+    assert!(
+        bench
+            .measurement
+            .diagnosis()
+            .latched()
+            .contains(Code::KeyCalibrationFailed)
+    );
+    assert!(bench.readings().high_voltage_permit);
+    assert_eq!(bench.order(Order::ClearDiagnoses), Ok(()));
+    // High voltage with the key OFF is without a permit.
+    bench.vehicle.acc_line = false;
+    bench.vehicle.hv_feedback = true;
+    bench.run_ms(2_500);
+    assert!(bench.has(Code::HvWithoutPermit));
+    assert!(bench.readings().high_voltage_on);
+}
