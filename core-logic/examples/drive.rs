@@ -163,7 +163,7 @@ fn drive(recording: &str, scale: &str, out: &Path) -> Result<String, Box<dyn Err
                         written = Err(error);
                     }
                 });
-                if at_us % 100_000 == 0 {
+                if at_us.is_multiple_of(100_000) {
                     let current = board.measurement.current();
                     let measured = if current.validity.is_valid() {
                         format!("{:.6}", f64::from(current.current.get()) * 1e-6)

@@ -25,7 +25,10 @@ use crate::error_budget;
 use crate::front_end::PerRange;
 use crate::meter::MeterReport;
 use crate::range::Range;
-use crate::units::{Duration, Instant, Microamps, Nanocoulombs, Ppm, clamp_i64, elapsed};
+use crate::units::{
+    Duration, Instant, Microamps, Nanocoulombs, Ppm, add_i128, clamp_i64, div_i128, elapsed,
+    milliseconds, mul_i128, mul_wide, sub_i128,
+};
 
 /// Tolerances and windows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -140,10 +143,11 @@ struct Integral {
 }
 
 impl Integral {
+    #[inline(never)]
     const fn since(&self, earlier: &Self) -> Self {
         Self {
-            charge: self.charge.saturating_sub(earlier.charge),
-            doubt: self.doubt.saturating_sub(earlier.doubt),
+            charge: sub_i128(self.charge, earlier.charge),
+            doubt: sub_i128(self.doubt, earlier.doubt),
             covered: self.covered.saturating_sub(earlier.covered),
         }
     }
@@ -274,12 +278,12 @@ impl ChannelCompare {
         self.span_gap(config, &gap, from, end.min(to), conversion.range);
         self.span(config, conversion, to, end.max(to));
         // Inside one conversion only its mean is known.
-        let step = i128::from(conversion.current.get()) - i128::from(previous.current.get());
+        let step = i64::from(conversion.current.get()) - i64::from(previous.current.get());
         let length = elapsed(from, conversion.finished);
-        let edge = step.abs() * i128::from(length.as_ticks()) / 2;
-        self.integral.doubt = self.integral.doubt.saturating_add(edge);
+        let edge = charge_of(step.abs(), length) / 2;
+        self.integral.doubt = add_i128(self.integral.doubt, edge);
         self.evaluate(config, point);
-        self.integral.doubt = self.integral.doubt.saturating_add(edge);
+        self.integral.doubt = add_i128(self.integral.doubt, edge);
         self.span_gap(config, &gap, end.min(to), to, conversion.range);
         self.span(config, conversion, end.max(to), conversion.finished);
         self.pending = None;
@@ -311,9 +315,7 @@ impl ChannelCompare {
             }
         }
         let due = |window: &Option<Window>, length_ms: u32| {
-            window.is_none_or(|window| {
-                elapsed(window.meter.at, at).as_millis() >= u64::from(length_ms)
-            })
+            window.is_none_or(|window| elapsed(window.meter.at, at) >= milliseconds(length_ms))
         };
         match self.pending {
             None => {
@@ -324,7 +326,7 @@ impl ChannelCompare {
             }
             Some(pending) => {
                 // No usable conversion for a whole window: there is nothing to wait for.
-                if elapsed(pending.at, at).as_millis() >= u64::from(config.fast_window_ms) {
+                if elapsed(pending.at, at) >= milliseconds(config.fast_window_ms) {
                     self.restart(false);
                 }
             }
@@ -343,10 +345,12 @@ impl ChannelCompare {
         self.report.frozen &= keep_frozen;
     }
 
+    #[inline(never)]
     fn span(&mut self, config: &CompareConfig, of: &Conversion, from: Instant, to: Instant) {
         self.add(config, of.current, of.range, elapsed(from, to), true);
     }
 
+    #[inline(never)]
     fn span_gap(
         &mut self,
         config: &CompareConfig,
@@ -357,10 +361,10 @@ impl ChannelCompare {
     ) {
         let time = elapsed(from, to);
         self.add(config, gap.mean, range, time, gap.covered);
-        let doubt = i128::from(gap.doubt) * i128::from(time.as_ticks());
-        self.integral.doubt = self.integral.doubt.saturating_add(doubt);
+        self.integral.doubt = add_i128(self.integral.doubt, charge_of(gap.doubt, time));
     }
 
+    #[inline(never)]
     fn add(
         &mut self,
         config: &CompareConfig,
@@ -369,15 +373,17 @@ impl ChannelCompare {
         time: Duration,
         covered: bool,
     ) {
-        let ticks = i128::from(time.as_ticks());
-        let charge = i128::from(current.get()) * ticks;
-        let gain = charge.abs() / 1_000_000 * i128::from(config.gain_tolerance.get().max(0));
-        let zero = i128::from(config.zero_tolerance.get(range).get().max(0)) * ticks;
-        self.integral.charge = self.integral.charge.saturating_add(charge);
-        self.integral.doubt = self
-            .integral
-            .doubt
-            .saturating_add(gain.saturating_add(zero));
+        let charge = charge_of(i64::from(current.get()), time);
+        let gain = mul_i128(
+            div_i128(charge.abs(), 1_000_000),
+            i128::from(config.gain_tolerance.get().max(0)),
+        );
+        let zero = charge_of(
+            i64::from(config.zero_tolerance.get(range).get().max(0)),
+            time,
+        );
+        self.integral.charge = add_i128(self.integral.charge, charge);
+        self.integral.doubt = add_i128(self.integral.doubt, add_i128(gain, zero));
         if covered {
             self.integral.covered = self.integral.covered.saturating_add(time.as_ticks());
         }
@@ -409,20 +415,17 @@ impl ChannelCompare {
             return;
         };
         let since = self.integral.since(then);
-        let under_way = i128::from(last.current.get()).abs()
-            * i128::from(elapsed(last.started, last.finished).as_ticks());
-        let count = self
-            .fast
-            .map_or(0, |window| i128::from(window.meter.resolution.get()));
-        let bound = since
-            .doubt
-            .saturating_add(i128::from(FROZEN_COUNTS) * count * 1_000)
-            .saturating_mul(2)
-            .saturating_add(2 * under_way);
-        if self.fast.is_some()
-            && elapsed_at_least(since.covered, config.short_gap_ms)
-            && since.charge.abs() > bound
-        {
+        let Some(fast) = &self.fast else {
+            return;
+        };
+        let under_way = charge_of(
+            i64::from(last.current.get()).abs(),
+            elapsed(last.started, last.finished),
+        );
+        let counts = mul_wide(fast.meter.resolution.get(), FROZEN_COUNTS * 1_000);
+        let once = add_i128(add_i128(since.doubt, counts), under_way);
+        let bound = add_i128(once, once);
+        if elapsed_at_least(since.covered, config.short_gap_ms) && since.charge.abs() > bound {
             self.report.frozen = true;
         }
     }
@@ -455,15 +458,22 @@ fn gap_doubt(
     }
 }
 
+/// pC of a current in µA over a time.
+fn charge_of(microamps: i64, time: Duration) -> i128 {
+    // 2⁶³ µs are 292,000 years.
+    mul_wide(microamps, time.as_ticks().cast_signed())
+}
+
 fn midpoint(a: Microamps, b: Microamps) -> i32 {
     a.get().midpoint(b.get())
 }
 
 const fn elapsed_at_least(micros: u64, millis: u32) -> bool {
-    micros / 1_000 >= millis as u64
+    micros >= milliseconds(millis).as_ticks()
 }
 
 /// Ends `window` at `now` if it is due and begins the next; `None` when it is not.
+#[inline(never)]
 fn close(
     window: &mut Option<Window>,
     now: &Window,
@@ -475,20 +485,21 @@ fn close(
         return None;
     };
     let length = elapsed(begun.meter.at, now.meter.at);
-    if length.as_millis() < u64::from(length_ms) {
+    if length < milliseconds(length_ms) {
         return None;
     }
     let measured = now.converter.since(&begun.converter);
-    let share = i128::from(measured.covered) * 1_000_000;
-    let needed = i128::from(length.as_ticks()) * i128::from(config.covered_share.get());
+    let share = charge_of(1_000_000, Duration::from_ticks(measured.covered));
+    let needed = charge_of(i64::from(config.covered_share.get()), length);
     let outcome = if share < needed {
         Outcome::Undecided
     } else {
         let meter = now.meter.charge.saturating_sub(begun.meter.charge);
-        let difference = i128::from(meter.get()) - i128::from(clamp_i64(measured.charge / 1_000));
+        let difference =
+            i128::from(meter.get()) - i128::from(clamp_i64(div_i128(measured.charge, 1_000)));
         let uncertainty =
             i128::from(now.meter.uncertainty.get()) - i128::from(begun.meter.uncertainty.get());
-        let bound = i128::from(clamp_i64(measured.doubt / 1_000))
+        let bound = i128::from(clamp_i64(div_i128(measured.doubt, 1_000)))
             + uncertainty.abs()
             + i128::from(begun.meter.resolution.get())
             + i128::from(now.meter.resolution.get());

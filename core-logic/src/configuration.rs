@@ -262,34 +262,25 @@ impl Configuration {
     }
 
     fn contradiction(&self) -> Option<Contradiction> {
-        let unless = |holds, contradiction| match holds {
-            true => Ok(()),
-            false => Err(contradiction),
-        };
-        let results = [
-            self.front_end.validate().map_err(Contradiction::FrontEnd),
-            self.converter.validate().map_err(Contradiction::Converter),
-            unless(self.zero_drift.is_valid(), Contradiction::ZeroDrift),
-            unless(
-                self.open_sensor.is_valid(&self.front_end),
-                Contradiction::OpenSensor,
-            ),
-            unless(
-                self.temperature_limits.is_sorted_by(|low, high| low < high),
-                Contradiction::Temperature,
-            ),
-            unless(
-                self.key_calibration.settle_ms < self.key_calibration.max_delay_ms,
-                Contradiction::KeyCalibrationDelay,
-            ),
-            unless(
-                self.compare.fast_window_ms < self.compare.slow_window_ms,
-                Contradiction::CompareWindows,
-            ),
-            unless(self.derived() == self.repeated(), Contradiction::Derived),
-            self.ocv.validate().map_err(Contradiction::Ocv),
-        ];
-        results.into_iter().find_map(Result::err)
+        if let Err(violation) = self.front_end.validate() {
+            Some(Contradiction::FrontEnd(violation))
+        } else if let Err(violation) = self.converter.validate() {
+            Some(Contradiction::Converter(violation))
+        } else if !self.zero_drift.is_valid() {
+            Some(Contradiction::ZeroDrift)
+        } else if !self.open_sensor.is_valid(&self.front_end) {
+            Some(Contradiction::OpenSensor)
+        } else if !self.temperature_limits.is_sorted_by(|low, high| low < high) {
+            Some(Contradiction::Temperature)
+        } else if self.key_calibration.settle_ms >= self.key_calibration.max_delay_ms {
+            Some(Contradiction::KeyCalibrationDelay)
+        } else if self.compare.fast_window_ms >= self.compare.slow_window_ms {
+            Some(Contradiction::CompareWindows)
+        } else if self.derived() != self.repeated() {
+            Some(Contradiction::Derived)
+        } else {
+            self.ocv.validate().err().map(Contradiction::Ocv)
+        }
     }
 
     /// CRC-32 over every value, those that [`Configuration::derive`] makes included.
@@ -312,12 +303,12 @@ impl Configuration {
     }
 
     /// Every value in use, in the order of [`FIELDS`].
-    fn values(&self) -> impl Iterator<Item = (&'static Field, usize, i64)> {
-        FIELDS.iter().flat_map(move |field| {
-            (0..usize::from(field.layout.count)).filter_map(move |element| {
-                (field.get)(self, element).map(|value| (field, element, value))
-            })
-        })
+    const fn values(&self) -> Values {
+        Values {
+            configuration: *self,
+            row: 0,
+            element: 0,
+        }
     }
 
     /// What [`Configuration::derive`] sets.
@@ -339,6 +330,34 @@ impl Configuration {
             self.meter.switching_current,
             self.front_end.full_scale(Range::Small),
         )
+    }
+}
+
+/// See [`Configuration::values`]. A copy, since a field gives access to what it reads.
+struct Values {
+    configuration: Configuration,
+    row: usize,
+    element: usize,
+}
+
+impl Iterator for Values {
+    type Item = (&'static Field, usize, i64);
+
+    #[inline(never)]
+    fn next(&mut self) -> Option<Self::Item> {
+        loop {
+            let field = FIELDS.get(self.row)?;
+            let element = self.element;
+            if element >= usize::from(field.layout.count) {
+                self.row += 1;
+                self.element = 0;
+                continue;
+            }
+            self.element += 1;
+            if let Some(value) = field.get_in(&mut self.configuration, element) {
+                return Some((field, element, value));
+            }
+        }
     }
 }
 
@@ -420,7 +439,7 @@ fn values_from(mut payload: &[u8]) -> Result<Configuration, ConfigurationError> 
     let mut configuration = Configuration::default();
     for field in FIELDS {
         for element in 0..usize::from(field.layout.count) {
-            if (field.get)(&configuration, element).is_none() {
+            if field.get_in(&mut configuration, element).is_none() {
                 continue;
             }
             let (value, rest) = postcard::take_from_bytes::<i64>(payload)
@@ -649,7 +668,7 @@ mod tests {
                 (0..usize::from(field.layout.count)).map(|element| {
                     (
                         (field.layout.address, element),
-                        (field.get)(configuration, element),
+                        field.get(configuration, element),
                     )
                 })
             })
@@ -669,7 +688,7 @@ mod tests {
             let mut configuration = Configuration::default();
             field(0x0100).put(&mut configuration, 0, front_end).unwrap();
             assert_eq!(configuration.validate(), Ok(()), "{front_end}");
-            assert_eq!((field(0x0100).get)(&configuration, 0), Some(front_end));
+            assert_eq!(field(0x0100).get(&configuration, 0), Some(front_end));
             assert_eq!(decode(&record(&configuration)), Ok(configuration));
         }
     }
@@ -715,7 +734,7 @@ mod tests {
             let before = values(&base);
             for field in &FIELDS[1..] {
                 for element in 0..usize::from(field.layout.count) {
-                    let Some(old) = (field.get)(&base, element) else {
+                    let Some(old) = field.get(&base, element) else {
                         let id = FieldId {
                             address: field.layout.address,
                             element,
@@ -743,7 +762,7 @@ mod tests {
                 // No element behind the last.
                 let behind = usize::from(field.layout.count);
                 if behind > 1 {
-                    assert_eq!((field.get)(&base, behind), None);
+                    assert_eq!(field.get(&base, behind), None);
                     assert!(field.put(&mut base.clone(), behind, field.min).is_err());
                 }
             }
@@ -792,7 +811,7 @@ mod tests {
         let mut configuration = Configuration::default();
         field(0x0108).put(&mut configuration, 0, 2_600_000).unwrap();
         FIELDS[0].put(&mut configuration, 0, 0).unwrap();
-        assert_eq!((field(0x0108).get)(&configuration, 0), Some(2_600_000));
+        assert_eq!(field(0x0108).get(&configuration, 0), Some(2_600_000));
         FIELDS[0].put(&mut configuration, 0, 1).unwrap();
         FIELDS[0].put(&mut configuration, 0, 0).unwrap();
         assert_eq!(configuration, Configuration::default());

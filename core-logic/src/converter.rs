@@ -409,7 +409,7 @@ impl ConverterCoefficients {
             Channel::Ads1100 => self.code_limit,
             Channel::Adc1 => 1 << ADC1_INPUT_BITS,
         };
-        input.clamp(-limit, limit)
+        input.min(limit).max(-limit)
     }
 }
 
@@ -420,18 +420,21 @@ const fn evaluate(slope: i64, offset: i64, input: i32) -> i32 {
 
 /// `value · multiplier / divisor`, rounded to nearest, for a positive divisor: [`mul_div`] with 64-bit divisions alone
 /// wherever the parts fit, some ten times cheaper than one of 128 bits.
+#[inline(never)]
 const fn scale(value: i64, multiplier: i64, divisor: i64) -> i64 {
     if multiplier == divisor {
         return value;
     }
-    let whole = (value / divisor).checked_mul(multiplier);
-    let rest = (value % divisor).checked_mul(multiplier);
-    match (whole, rest) {
+    let (Some(whole), Some(rest)) = (value.checked_div(divisor), value.checked_rem(divisor)) else {
+        return mul_div(value, multiplier, divisor);
+    };
+    match (whole.checked_mul(multiplier), rest.checked_mul(multiplier)) {
         (Some(whole), Some(rest)) => whole.saturating_add(div_round(rest, divisor)),
         _ => mul_div(value, multiplier, divisor),
     }
 }
 
+#[inline(never)]
 fn fold(
     config: &ConverterConfig,
     front_end: &FrontEnd,
@@ -481,7 +484,9 @@ fn fold(
     };
     let folded = |value: i64, input_bits: u32| {
         let limit = TERM_LIMIT >> input_bits;
-        div_round(value, 1 << (FOLDING_BITS - FRACTION_BITS)).clamp(-limit, limit)
+        div_round(value, 1 << (FOLDING_BITS - FRACTION_BITS))
+            .min(limit)
+            .max(-limit)
     };
 
     let unit = 1_i64 << FOLDING_BITS;

@@ -65,8 +65,8 @@ use crate::design_parameters as design;
 use crate::front_end::PerRange;
 use crate::range::{Range, RangeHistory, RangeInterval};
 use crate::units::{
-    Duration, Instant, Microamps, Nanocoulombs, Ppm, clamp_i32, clamp_i64, div_round,
-    div_round_i128, elapsed, mul_div,
+    Duration, Instant, Microamps, Nanocoulombs, Ppm, add_i128, clamp_i32, clamp_i64, div_round,
+    div_round_i128, elapsed, milliseconds, mul_div, mul_i128, mul_wide,
 };
 
 /// Binary digits of a picocoulomb in which charge is summed.
@@ -162,20 +162,24 @@ impl MeterConfig {
     }
 
     /// Charge of one count in units of 2⁻²⁴ pC; at least 1, so that no configuration can make it a divisor of zero.
+    #[inline(never)]
     const fn scale(&self, range: Range) -> i64 {
+        const PICOAMPS_BY_INPUT: i64 = 1_000_000
+            * design::METER_FULL_SCALE_INPUT.get() as i64
+            * design::METER_CLOCKS_PER_ACCUMULATION as i64;
         // µA at full scale · 10⁶ pC/µC / (product · V2 / 0.5 V · CLKIN / 4 / 2²⁵) · 2²⁴: 2¹²¹ at most.
-        let numerator = ((self.full_scale.get(range).get() as i128)
-            * 1_000_000
-            * (design::METER_FULL_SCALE_INPUT.get() as i128)
-            * (design::METER_CLOCKS_PER_ACCUMULATION as i128))
+        let numerator = mul_wide(self.full_scale.get(range).get() as i64, PICOAMPS_BY_INPUT)
             << (design::METER_HIDDEN_BITS + FRACTION_BITS);
         let denominator = design::METER_DC_FULL_SCALE_PRODUCT as i128
             * design::METER_CHANNEL_2.get() as i128
             * design::METER_CLKIN_HZ as i128;
-        let nominal = clamp_i64(div_round_i128(numerator, denominator)) as i128;
+        let nominal = clamp_i64(div_round_i128(numerator, denominator));
         let corrected = div_round_i128(
-            nominal * factor(self.gain.get(range)) * factor(self.reference_error),
-            factor(Ppm(0)) * factor(self.divider_error),
+            mul_i128(
+                mul_wide(nominal, factor(self.gain.get(range))),
+                factor(self.reference_error) as i128,
+            ),
+            mul_wide(factor(Ppm(0)), factor(self.divider_error)),
         );
         let scale = clamp_i64(corrected);
         if scale < 1 { 1 } else { scale }
@@ -193,8 +197,8 @@ impl Default for MeterConfig {
 }
 
 /// 1 + error, in millionths; at least one millionth.
-const fn factor(error: Ppm) -> i128 {
-    let sum = Ppm::ONE.get() as i128 + error.get() as i128;
+const fn factor(error: Ppm) -> i64 {
+    let sum = Ppm::ONE.get() as i64 + error.get() as i64;
     if sum < 1 { 1 } else { sum }
 }
 
@@ -333,8 +337,9 @@ impl Accumulator {
     }
 
     /// Adds `charge` in units of 2⁻²⁴ pC.
+    #[inline(never)]
     fn add(&mut self, charge: i128) {
-        let sum = charge.saturating_add(i128::from(self.carry));
+        let sum = add_i128(charge, i128::from(self.carry));
         // Split at the picocoulomb first: a shift, so that the division needs 64 bits only.
         let picocoulombs = clamp_i64(sum >> FRACTION_BITS);
         let fraction = clamp_i64(sum & ((1 << FRACTION_BITS) - 1));
@@ -368,9 +373,13 @@ impl Coefficients {
             large: config.scale(Range::Large),
         };
         let step = |range: Range| {
-            let own = i128::from(scale.get(range));
-            let other = i128::from(scale.get(range.other()));
-            let quotient = clamp_i64(div_round_i128((own - other) << 32, own));
+            let own = scale.get(range);
+            // Both are positive.
+            let difference = own - scale.get(range.other());
+            let quotient = clamp_i64(div_round_i128(
+                mul_wide(difference, 1 << 32),
+                i128::from(own),
+            ));
             quotient.clamp(-LARGEST_STEP_Q32, LARGEST_STEP_Q32)
         };
         Self {
@@ -388,22 +397,27 @@ impl Coefficients {
         let length = i128::from(interval.length().as_ticks());
         let share_large = div_round_i128(i128::from(interval.large.as_ticks()) << 32, length);
         let small_per_large = div_round_i128(small << 32, large);
-        let weight = (1 << 32) - share_large + ((share_large * small_per_large) >> 32);
+        let weight = (1 << 32) - share_large + (mul_i128(share_large, small_per_large) >> 32);
         clamp_i64(div_round_i128(small << 32, weight))
     }
 }
 
 /// Charge in units of 2⁻²⁴ pC from a current in µA over a time in µs.
+#[inline(never)]
 fn charge_of(current: Microamps, time: Duration) -> i128 {
-    (i128::from(current.get()) * i128::from(time.as_ticks())) << FRACTION_BITS
+    // 2⁶³ µs are 292,000 years.
+    mul_wide(i64::from(current.get()), time.as_ticks().cast_signed()) << FRACTION_BITS
 }
 
 /// `charge` times a factor with 32 binary digits.
+#[inline(never)]
 fn times(charge: i128, factor_q32: i64) -> i128 {
     // Split, so that no product leaves 128 bits.
-    let (high, low) = (charge >> 32, charge & 0xFFFF_FFFF);
-    (high.saturating_mul(i128::from(factor_q32)))
-        .saturating_add((low * i128::from(factor_q32)) >> 32)
+    let (high, low) = (charge >> 32, clamp_i64(charge & 0xFFFF_FFFF));
+    add_i128(
+        mul_i128(high, i128::from(factor_q32)),
+        mul_wide(low, factor_q32) >> 32,
+    )
 }
 
 /// The meter's charge. Owned by the meter task.
@@ -565,7 +579,7 @@ impl MeterChannel {
         let length = elapsed(last.at, reading.at);
         let charge = match bridge {
             GapBridge::MeanCurrent(current) => charge_of(current, length),
-            GapBridge::Charge(charge) => i128::from(charge.get()) * i128::from(NANOCOULOMB),
+            GapBridge::Charge(charge) => mul_wide(charge.get(), NANOCOULOMB),
             GapBridge::Unknown => 0,
         };
         self.book(charge);
@@ -574,12 +588,13 @@ impl MeterChannel {
             GapBridge::Unknown => charge_of(self.config.full_scale.large.saturating_abs(), length),
             _ => {
                 let gain = i128::from(self.config.bridge_gain.get()).abs();
-                div_round_i128(charge.abs(), i128::from(Ppm::ONE.get()))
-                    .saturating_mul(gain)
-                    .saturating_add(charge_of(
-                        self.config.bridge_offset.saturating_abs(),
-                        length,
-                    ))
+                add_i128(
+                    mul_i128(
+                        div_round_i128(charge.abs(), i128::from(Ppm::ONE.get())),
+                        gain,
+                    ),
+                    charge_of(self.config.bridge_offset.saturating_abs(), length),
+                )
             }
         };
         self.uncertainty.add(doubt);
@@ -603,7 +618,7 @@ impl MeterChannel {
             charge_total: self.total.rounded(),
             charge_in: self.input.rounded(),
             charge_out: self.output.rounded(),
-            resolution: self.config.charge_per_count(range),
+            resolution: Nanocoulombs(div_round(self.coefficients.scale.get(range), NANOCOULOMB)),
             mean_current: self.mean_current,
             mean_over: self.mean_over,
             mean_begun: self.mean_begun,
@@ -684,10 +699,10 @@ impl MeterChannel {
         }
         let charge = self.counted_charge(counts, long) - self.offset_charge(interval);
         if self.sign == 0 {
-            self.pending = self.pending.saturating_add(correction);
+            self.pending = add_i128(self.pending, correction);
             self.book(charge);
         } else {
-            self.book(charge + correction * i128::from(self.sign));
+            self.book(charge + self.signed(correction));
         }
         self.hand_overs = self.hand_overs.saturating_add(interval.edges);
 
@@ -702,13 +717,17 @@ impl MeterChannel {
         let stamps = Duration::from_ticks(
             design::EDGE_STAMP_DELAY_US.saturating_mul(u64::from(interval.edges)),
         );
-        let doubt = charge_of(self.config.switching_tolerance.saturating_abs(), estimated)
-            .saturating_add(self.slew_charge(estimated, Duration::from_ticks(0)))
-            .min(charge_of(span, estimated))
-            .saturating_add(charge_of(
+        let doubt = add_i128(
+            add_i128(
+                charge_of(self.config.switching_tolerance.saturating_abs(), estimated),
+                self.slew_charge(estimated, Duration::from_ticks(0)),
+            )
+            .min(charge_of(span, estimated)),
+            charge_of(
                 switching_current,
                 stamps.saturating_add(interval.unseen.min(LONGEST_INTERVAL)),
-            ));
+            ),
+        );
         self.uncertainty
             .add(times(doubt, step.get(short).saturating_abs()));
         if interval.edges == 1 && estimated.as_ticks() <= 2 * design::SNAPSHOT_DEADLINE_US {
@@ -731,9 +750,9 @@ impl MeterChannel {
         self.change_scale(0);
         let charge = charge_of(self.config.switching_current, length);
         if self.sign == 0 {
-            self.pending = self.pending.saturating_add(charge);
+            self.pending = add_i128(self.pending, charge);
         } else {
-            self.book(charge * i128::from(self.sign));
+            self.book(self.signed(charge));
         }
         let after = interval.since_last_edge.unwrap_or(length);
         let before = length.saturating_sub(after);
@@ -742,11 +761,13 @@ impl MeterChannel {
             charge_of(self.config.switching_current.saturating_abs(), delay),
             self.coefficients.step.small.saturating_abs(),
         );
-        self.uncertainty.add(
-            charge_of(self.config.switching_tolerance.saturating_abs(), length)
-                .saturating_add(self.slew_charge(after, before))
-                .saturating_add(remembered),
-        );
+        self.uncertainty.add(add_i128(
+            add_i128(
+                charge_of(self.config.switching_tolerance.saturating_abs(), length),
+                self.slew_charge(after, before),
+            ),
+            remembered,
+        ));
         self.estimated_intervals = self.estimated_intervals.saturating_add(1);
         ReadingOutcome::Estimated
     }
@@ -757,13 +778,14 @@ impl MeterChannel {
         self.sign = 0;
         let scale = self.coefficients.harmonic(interval);
         self.change_scale(scale);
-        self.book(i128::from(counts) * i128::from(scale) - self.offset_charge(interval));
+        self.book(mul_wide(i64::from(counts), scale) - self.offset_charge(interval));
         self.uncertainty.add(self.harmonic_doubt(scale, interval));
         self.estimated_intervals = self.estimated_intervals.saturating_add(1);
         ReadingOutcome::Estimated
     }
 
     /// What the offsets have counted.
+    #[inline(never)]
     fn offset_charge(&self, interval: &RangeInterval) -> i128 {
         charge_of(
             self.config.offset.small,
@@ -793,31 +815,49 @@ impl MeterChannel {
             ),
             self.coefficients.step.small.saturating_abs(),
         );
-        of_shape.saturating_add(of_times)
+        add_i128(of_shape, of_times)
     }
 
     /// What the slew limit allows a current to add within two times from a known point: slew · (t₁² + t₂²) / 2.
+    #[inline(never)]
     fn slew_charge(&self, first: Duration, second: Duration) -> i128 {
         let square = |time: Duration| {
-            let ticks = i128::from(time.as_ticks().min(LONGEST_INTERVAL.as_ticks()));
+            // (7.8·10⁸ µs)² is below 2⁶⁰.
+            let ticks = time
+                .as_ticks()
+                .min(LONGEST_INTERVAL.as_ticks())
+                .cast_signed();
             ticks * ticks
         };
-        (i128::from(self.config.slew_limit_amps_per_second) * (square(first) + square(second)))
-            << (FRACTION_BITS - 1)
+        mul_wide(
+            i64::from(self.config.slew_limit_amps_per_second),
+            square(first) + square(second),
+        ) << (FRACTION_BITS - 1)
     }
 
     fn counted_charge(&self, counts: i32, range: Range) -> i128 {
-        i128::from(counts) * i128::from(self.coefficients.scale.get(range))
+        mul_wide(i64::from(counts), self.coefficients.scale.get(range))
+    }
+
+    /// `charge`, which is as for a positive current, by the known sign.
+    const fn signed(&self, charge: i128) -> i128 {
+        if self.sign < 0 {
+            charge.saturating_neg()
+        } else {
+            charge
+        }
     }
 
     /// The counts are taken by another scale from here on: the hidden bits of the reading in between are misjudged by
     /// up to half the difference.
+    #[inline(never)]
     fn change_scale(&mut self, scale: i64) {
         let difference = i128::from(scale) - i128::from(self.last_scale);
         self.last_scale = scale;
         self.uncertainty.add(difference.abs() / 2);
     }
 
+    #[inline(never)]
     fn book(&mut self, charge: i128) {
         self.total.add(charge);
         if charge < 0 {
@@ -828,6 +868,7 @@ impl MeterChannel {
     }
 
     /// Counts made while the current could not change its sign.
+    #[inline(never)]
     fn learn_sign(&mut self, counts: i32, now: Instant) {
         if counts != 0 {
             self.sign = if counts < 0 { -1 } else { 1 };
@@ -840,6 +881,7 @@ impl MeterChannel {
 
     /// Books what waited for the sign: by the sign if it is known, else by that of `counts`, a guess that may be wrong
     /// by twice the amount.
+    #[inline(never)]
     fn settle_pending(&mut self, counts: i32) {
         let sign = if self.sign == 0 {
             counts.signum()
@@ -850,10 +892,9 @@ impl MeterChannel {
             let pending = self.pending;
             self.pending = 0;
             if self.sign == 0 {
-                self.uncertainty
-                    .add(pending.saturating_abs().saturating_mul(2));
+                self.uncertainty.add(mul_i128(pending.saturating_abs(), 2));
             }
-            self.book(pending.saturating_mul(i128::from(sign)));
+            self.book(mul_i128(pending, i128::from(sign)));
         }
     }
 
@@ -880,10 +921,11 @@ impl MeterChannel {
         }
     }
 
+    #[inline(never)]
     fn update_mean(&mut self, now: Instant) {
         let (begin, charge) = *self.window.get_or_insert((now, self.total));
         let length = elapsed(begin, now);
-        if length.as_millis() < u64::from(self.config.mean_window_ms) || length.is_zero() {
+        if length < milliseconds(self.config.mean_window_ms) || length.is_zero() {
             return;
         }
         // nC per µs is mA.

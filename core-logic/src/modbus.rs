@@ -147,6 +147,12 @@ impl Command {
         ),
     ];
 
+    /// Every command without the texts, which the board has no use for.
+    const COMMANDS: [Self; 11] = {
+        let [a, b, c, d, e, f, g, h, i, j, k] = Self::ALL;
+        [a.0, b.0, c.0, d.0, e.0, f.0, g.0, h.0, i.0, j.0, k.0]
+    };
+
     /// The value of the command register that orders it.
     #[must_use]
     pub const fn register(self) -> u16 {
@@ -156,9 +162,8 @@ impl Command {
     /// The command that a value of the command register orders.
     #[must_use]
     pub fn from_register(value: u16) -> Option<Self> {
-        Self::ALL
-            .iter()
-            .map(|(command, ..)| *command)
+        Self::COMMANDS
+            .into_iter()
             .find(|command| command.register() == value)
     }
 
@@ -339,9 +344,9 @@ fn answer<const N: usize>(
                 }
                 put(reply, &readings.last_command.to_be_bytes())?;
             } else {
-                let active = store.active();
+                let mut active = *store.active();
                 read(FIELDS, address, quantity, reply, |field, element| {
-                    (field.get)(active, element).unwrap_or_default()
+                    field.get_in(&mut active, element).unwrap_or_default()
                 })?;
             }
             Ok(None)
@@ -387,7 +392,7 @@ fn for_each<R: Row>(
     table: &'static [R],
     address: u16,
     quantity: u16,
-    mut each: impl FnMut(&'static R, usize) -> Result<(), Exception>,
+    each: &mut dyn FnMut(&'static R, usize) -> Result<(), Exception>,
 ) -> Result<(), Exception> {
     let end = address
         .checked_add(quantity)
@@ -419,9 +424,9 @@ fn read<R: Row, const N: usize>(
     address: u16,
     quantity: u16,
     reply: &mut Vec<u8, N>,
-    value: impl Fn(&R, usize) -> i64,
+    mut value: impl FnMut(&R, usize) -> i64,
 ) -> Result<(), Exception> {
-    for_each(table, address, quantity, |row, element| {
+    for_each(table, address, quantity, &mut |row, element| {
         let kind = row.layout().kind;
         let value = value(row, element);
         for word in 0..kind.width() {
@@ -442,7 +447,7 @@ fn write(
     }
     let quantity = u16::try_from(values.len() / 2).map_err(|_| Exception::IllegalDataValue)?;
     let mut staged = *store.stage().map_err(|_| Exception::ServerDeviceFailure)?;
-    for_each(FIELDS, address, quantity, |field: &Field, _| {
+    for_each(FIELDS, address, quantity, &mut |field: &Field, _| {
         field.when.check(readings)
     })?;
     let mut words = values
@@ -450,7 +455,7 @@ fn write(
         .zip(values.iter().skip(1))
         .step_by(2)
         .map(|(high, low)| word([*high, *low]));
-    for_each(FIELDS, address, quantity, |field: &Field, element| {
+    for_each(FIELDS, address, quantity, &mut |field: &Field, element| {
         let kind = field.layout.kind;
         let bits = words
             .by_ref()
@@ -749,12 +754,12 @@ mod tests {
             let kind = field.layout.kind;
             let expected: Bytes<u16> = (0..usize::from(field.layout.count))
                 .flat_map(|element| {
-                    let value = (field.get)(board.store.active(), element).unwrap_or(0);
+                    let value = field.get(board.store.active(), element).unwrap_or(0);
                     (0..kind.width()).map(move |word| kind.word(value, word))
                 })
                 .collect();
             assert_eq!(got, expected);
-            let used = (field.get)(board.store.active(), 0).is_some();
+            let used = field.get(board.store.active(), 0).is_some();
             // What is there can be written back; what belongs to another front end cannot.
             let answer = board.write_many(field.layout.address, &got);
             assert_eq!(answer, if used { changed() } else { Err(3) }, "{field:?}");

@@ -33,8 +33,8 @@ use crate::design_parameters::{
 };
 use crate::ocv::OcvTable;
 use crate::units::{
-    Duration, Instant, Microamps, Microvolts, Nanocoulombs, Ppm, clamp_i32, clamp_i64,
-    div_round_i128, elapsed, mul_div,
+    Duration, Instant, Microamps, Microvolts, Nanocoulombs, Ppm, clamp_i32, clamp_i64, div_i128,
+    div_round, elapsed, milliseconds, mul_div, mul_wide,
 };
 
 /// Charging excursions up to this bear no efficiency loss: 150 counts of the small range, 15 of the large one, and a
@@ -154,20 +154,20 @@ impl SocCoefficients {
         // The smallest capacity is 2^31.7 nC, so there is always something to shift.
         let shift = (i64::BITS - 31).saturating_sub(capacity.leading_zeros());
         let scaled = capacity >> shift;
-        let reciprocal =
-            (i128::from(Ppm::ONE.get()) << RECIPROCAL_PLACES) / i128::from(scaled.max(1));
+        // 10⁶ · 2⁴² fits.
+        let reciprocal = (i64::from(Ppm::ONE.get()) << RECIPROCAL_PLACES) / scaled.max(1);
         let lost = Ppm::ONE.get()
             - config
                 .coulombic_efficiency
                 .get()
                 .clamp(500_000, Ppm::ONE.get());
-        let slew = i128::from(config.presented_slew_ppm_per_s.clamp(1, 10_000));
-        let slew_per_us = ((i128::from(capacity) * slew) << SLEW_PLACES) / 1_000_000_000_000;
+        let slew = i64::from(config.presented_slew_ppm_per_s.clamp(1, 10_000));
+        let slew_per_us = div_i128(mul_wide(capacity, slew) << SLEW_PLACES, 1_000_000_000_000);
         Self {
             config: *config,
             capacity,
             shift,
-            reciprocal: clamp_i64(reciprocal),
+            reciprocal,
             loss_q32: share_q32(lost),
             slew_per_us: clamp_i64(slew_per_us).max(1),
             throughput_q32: share_q32(
@@ -693,7 +693,7 @@ fn mul_q32(value: u64, factor_q32: u32, carry: u32) -> (i64, u32) {
 
 /// A share in 2⁻³², rounded to nearest: by at most 1.2·10⁻¹⁰.
 fn share_q32(ppm: i32) -> u32 {
-    let share = div_round_i128(i128::from(ppm) << 32, i128::from(Ppm::ONE.get()));
+    let share = div_round(i64::from(ppm) << 32, i64::from(Ppm::ONE.get()));
     u32::try_from(share).unwrap_or(u32::MAX)
 }
 
@@ -710,10 +710,6 @@ fn grown(per_us: u64, time_us: u64) -> i64 {
 
 fn seconds(seconds: u32) -> Duration {
     Duration::from_ticks(u64::from(seconds) * 1_000_000)
-}
-
-fn milliseconds(milliseconds: u32) -> Duration {
-    Duration::from_ticks(u64::from(milliseconds) * 1_000)
 }
 
 #[cfg(test)]

@@ -17,7 +17,10 @@ use crate::design_parameters::{
     SENSOR_NOMINAL_SUPPLY, SENSOR_SUPPLY_HIGH, SENSOR_SUPPLY_LOW, SENSOR_ZERO,
 };
 use crate::front_end::{SupplyRelations, TURNS_LIMITS};
-use crate::units::{Microamps, Microvolts, clamp_i32, clamp_i64, div_round_i128};
+use crate::units::{
+    Microamps, Microvolts, clamp_i32, clamp_i64, div_i128, div_round_i128, mul_i128, mul_wide,
+    sub_i128,
+};
 
 /// Points that one run takes.
 pub const MAX_POINTS: u16 = 256;
@@ -255,7 +258,7 @@ impl SupplyCalibration {
         // 10⁻¹² V/V · N / (10⁻⁶ A) is 10⁻⁶ Ω/V, that is 1,000 nΩ/V; the same from 10⁻¹² V to nΩ.
         let referred = |difference: i128| {
             clamp_i64(div_round_i128(
-                difference * i128::from(turns) * 1_000,
+                mul_i128(difference, i128::from(i64::from(turns) * 1_000)),
                 i128::from(test_current.get()),
             ))
         };
@@ -314,6 +317,12 @@ struct Sums {
     highest: i32,
 }
 
+/// a·b − c·d.
+#[inline(never)]
+fn determinant(a: i64, b: i64, c: i64, d: i64) -> i128 {
+    sub_i128(mul_wide(a, b), mul_wide(c, d))
+}
+
 /// A run's line, in 10⁻¹².
 struct Line {
     slope_pico: i128,
@@ -351,21 +360,26 @@ impl Sums {
         if span == 0 || span < config.min_span.get() {
             return Err(SupplyRefusal::SpanTooSmall(run, Microvolts(span)));
         }
-        let n = i128::from(self.count);
-        let [x, y, xx, xy, yy] = [self.x, self.y, self.xx, self.xy, self.yy].map(i128::from);
-        let (spread, covariance, scatter) = (n * xx - x * x, n * xy - x * y, n * yy - y * y);
+        let n = i64::from(self.count);
+        let spread = determinant(n, self.xx, self.x, self.x);
+        let covariance = determinant(n, self.xy, self.x, self.y);
+        let scatter = determinant(n, self.yy, self.y, self.y);
         // Sum of squared residuals: (scatter − covariance² / spread) / n.
-        let squares = scatter * spread - covariance * covariance;
-        let variance = squares / (n * (n - 2) * spread);
-        let limit = i128::from(config.max_residual.saturating_abs().get());
-        let residual = Microvolts(clamp_i32(clamp_i64(variance.max(0).isqrt())));
+        let squares = mul_i128(scatter, spread) - mul_i128(covariance, covariance);
+        // At most the square of the largest output, 2.5·10¹³ µV².
+        let variance = clamp_i64(div_i128(squares, mul_i128(i128::from(n * (n - 2)), spread)));
+        let limit = i64::from(config.max_residual.saturating_abs().get());
+        let residual = Microvolts(clamp_i32(variance.max(0).isqrt()));
         if variance > limit * limit {
             return Err(SupplyRefusal::Unstable(run, residual));
         }
         Ok(Line {
-            slope_pico: div_round_i128(covariance * PICO_PER_UNIT, spread),
+            slope_pico: div_round_i128(mul_i128(covariance, PICO_PER_UNIT), spread),
             // µV to 10⁻¹² V
-            intercept_pico: div_round_i128((y * xx - x * xy) * 1_000_000, spread),
+            intercept_pico: div_round_i128(
+                mul_i128(determinant(self.y, self.xx, self.x, self.xy), 1_000_000),
+                spread,
+            ),
             residual,
         })
     }

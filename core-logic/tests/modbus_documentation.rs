@@ -47,7 +47,7 @@ fn defaults(field: &Field) -> String {
         let mut configuration = Configuration::default();
         FIELDS[0].put(&mut configuration, 0, front_end).unwrap();
         let values: Vec<i64> = (0..usize::from(field.layout.count))
-            .map_while(|element| (field.get)(&configuration, element))
+            .map_while(|element| field.get(&configuration, element))
             .collect();
         if values.is_empty() {
             continue;

@@ -10,32 +10,26 @@ use core_logic::{
 use stm32f4xx_hal::{
     gpio::{Edge, ExtiPin, GpioExt, Input, Output, PA0, PA4, PB12, PC4, PinState},
     pac::{self, EXTI, SPI1, SPI2},
-    rcc::{Config, Enable, RccExt, Reset},
+    rcc::{Enable, Reset},
     syscfg::SysCfgExt,
-    time::Hertz,
 };
 
 use crate::{
     analog::Analog,
-    can_bus, i2c,
+    can_bus, clock, i2c,
     inputs::Lines,
     retain::{self, Previous, ResetCause, Stage},
     rs485, spi, time,
     watchdog::Watchdog,
 };
 
-const CRYSTAL: Hertz = Hertz::MHz(8);
-/// Core and AHB; SysTick counts it.
-pub const CORE_HZ: u32 = 168_000_000;
 /// RTIC's priority 3 in the four bits that the core has: (16 − 3) << 4.
 pub const SYSTICK_PRIORITY: u8 = (16 - 3) << 4;
-const APB1: Hertz = Hertz::MHz(42);
-const APB2: Hertz = Hertz::MHz(84);
 
-/// Mode 1 at APB2 / 64 = 1.3125 MHz (`design_parameters::METER_SPI_HZ`).
+/// Mode 1 at APB2 / 32 = 2.625 MHz (`design_parameters::METER_SPI_HZ`).
 const METER_SPI: spi::Settings = spi::Settings {
     second_edge: true,
-    baud: 5,
+    baud: 4,
 };
 /// Mode 0 at APB1 / 2 = 21 MHz; the flash's slowest read command takes 50 MHz.
 const FLASH_SPI: spi::Settings = spi::Settings {
@@ -62,11 +56,12 @@ impl Edges {
         self.recorder.on_edge(now, self.flag.is_high());
         if self.guard.on_event(&self.config, now) == StormAction::Mask {
             self.flag.disable_interrupt(&mut self.exti);
+            self.recorder.suspend(now);
         }
     }
 
     /// Called by the meter's task: ends the rest after a storm, and finds an edge that no interrupt told of. Whether
-    /// there was one.
+    /// a snapshot is due.
     pub fn poll(&mut self, now: Instant) -> bool {
         match self.guard.poll(&self.config, now) {
             StormAction::Unmask => {
@@ -179,7 +174,7 @@ pub struct Board {
 impl Board {
     /// Starts the hardware, with interrupts disabled.
     ///
-    /// The watchdog is first: the HAL waits for crystal and PLL without a bound, and a crystal that does not swing then
+    /// The watchdog is first: crystal and PLL are waited for without a bound, and a crystal that does not swing then
     /// ends in a watchdog reset whose stage is kept. The board stays silent and withholds its permit, as it must
     /// without a time base; its pins are in their reset state meanwhile.
     pub fn start(dp: pac::Peripherals, configuration: &Configuration) -> Self {
@@ -187,11 +182,8 @@ impl Board {
         let previous = retain::begin(ResetCause::take(&dp.RCC));
 
         retain::note_stage(Stage::Clock);
-        let clocks = Config::hse(CRYSTAL)
-            .sysclk(Hertz::Hz(CORE_HZ))
-            .pclk1(APB1)
-            .pclk2(APB2);
-        let mut rcc = dp.RCC.freeze(clocks);
+        let mut rcc = dp.RCC;
+        clock::start(&rcc, &dp.FLASH);
 
         retain::note_stage(Stage::Peripherals);
         time::start(dp.TIM2, &mut rcc);

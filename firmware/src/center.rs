@@ -206,9 +206,10 @@ impl Center {
             self.found = Some(found);
         }
         for code in tick.changes.set.iter() {
-            self.last_codes.rotate_right(1);
-            if let Some(newest) = self.last_codes.first_mut() {
-                *newest = code.number();
+            // Not `rotate_right`: it alone would need `memmove`, 1.6 kB.
+            let mut newer = code.number();
+            for place in &mut self.last_codes {
+                core::mem::swap(place, &mut newer);
             }
             self.log_due = true;
         }

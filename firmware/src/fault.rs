@@ -1,15 +1,40 @@
 //! The end of a program that cannot go on: the cause goes into retained memory, then the core is reset.
 //!
-//! A panic is panic-probe's: it prints the panic through defmt and executes `udf`. The handler here finds that
-//! instruction, takes the printed frame out of the RTT channel and keeps its text. So panic-probe stays the one panic
-//! handler, a probe sees the panic as ever, and a board in the field still knows after its reset where it was.
-
-use core::sync::atomic::{AtomicU32, Ordering};
+//! A debug build panics through panic-probe, which formats the whole message for an attached probe. A release image
+//! has no room for the formatting of messages (`core::fmt`, 12 kB with its texts): its handler keeps file and line,
+//! shows them to a probe, and ends as panic-probe does, with `udf`. The HardFault handler recognises that instruction.
 
 use cortex_m::peripheral::SCB;
 use cortex_m_rt::exception;
+#[cfg(debug_assertions)]
+use panic_probe as _;
 
 use crate::retain::{self, Fault, FaultKind};
+
+/// So short that the compiler sees through it: nobody looks at the message, so none is built.
+#[cfg(not(debug_assertions))]
+#[panic_handler]
+#[allow(
+    unused_attributes,
+    reason = "the compiler warns that it ignores this; link-time optimization heeds it and saves 2 kB"
+)]
+#[inline(always)]
+fn panic(info: &core::panic::PanicInfo<'_>) -> ! {
+    end(info.location())
+}
+
+#[cfg(not(debug_assertions))]
+#[inline(never)]
+fn end(location: Option<&core::panic::Location<'_>>) -> ! {
+    cortex_m::interrupt::disable();
+    // There always is one, as Rust documents.
+    let (file, line) = location.map_or(("", 0), |location| (location.file(), location.line()));
+    // Kept before it is shown: showing it is code that may have panicked itself.
+    if retain::note_panic(file, line) {
+        defmt::error!("panicked at {=str}:{=u32}", file, line);
+    }
+    cortex_m::asm::udf()
+}
 
 /// The lowest address of the stack (memory.x).
 const STACK_BOTTOM: u32 = 0x1000_0000;
@@ -67,9 +92,6 @@ extern "C" fn on_hard_fault(stack_pointer: u32) -> ! {
     } else {
         FaultKind::HardFault
     };
-    if kind == FaultKind::Panic {
-        retain::note_text(rtt::last_panic());
-    }
     retain::note_fault(Fault {
         kind,
         pc,
@@ -79,7 +101,7 @@ extern "C" fn on_hard_fault(stack_pointer: u32) -> ! {
     SCB::sys_reset()
 }
 
-/// Whether the instruction is `udf`, with which panic-probe ends.
+/// Whether the instruction is `udf`, with which a panic ends.
 fn is_udf(pc: u32) -> bool {
     const FLASH: core::ops::Range<u32> = 0x0800_0000..0x0810_0000;
     if !FLASH.contains(&pc) || !pc.is_multiple_of(2) {
@@ -105,101 +127,4 @@ unsafe fn DefaultHandler(_number: i16) -> ! {
         status: 0,
     });
     SCB::sys_reset()
-}
-
-/// The last frame in the RTT channel that defmt-rtt writes, decoded from reverse-zero-compressing COBS.
-mod rtt {
-    use super::{AtomicU32, Ordering};
-
-    /// SEGGER's control block with one channel, the public layout that every RTT host searches for.
-    #[repr(C)]
-    struct ControlBlock {
-        id: [u8; 16],
-        up_channels: u32,
-        down_channels: u32,
-        name: u32,
-        buffer: u32,
-        size: u32,
-        write: AtomicU32,
-        read: AtomicU32,
-        flags: AtomicU32,
-    }
-
-    unsafe extern "C" {
-        /// Of defmt-rtt, which writes it with atomic stores only.
-        safe static _SEGGER_RTT: ControlBlock;
-    }
-
-    /// A frame longer than this does not come from a panic's print.
-    const LONGEST_FRAME: usize = 512;
-    const START: &[u8] = b"panicked at ";
-
-    /// The channel's bytes, counted backwards from the newest.
-    fn newest(index: usize) -> Option<u8> {
-        let size = usize::try_from(_SEGGER_RTT.size).ok()?;
-        let write = usize::try_from(_SEGGER_RTT.write.load(Ordering::Acquire)).ok()?;
-        if index >= size || write >= size {
-            return None;
-        }
-        let offset = (write + size - 1 - index) % size;
-        let address = usize::try_from(_SEGGER_RTT.buffer).ok()? + offset;
-        // SAFETY: within the buffer that defmt-rtt gave to the control block; the core is in the fault handler, so
-        // nothing writes it meanwhile.
-        Some(unsafe { core::ptr::read_volatile(address as *const u8) })
-    }
-
-    /// Hands the bytes of the last frame to `each`, last byte first, until it returns false.
-    ///
-    /// Each group is followed by its code, so the stream is read backwards. A code below 0x80 stands for seven bytes,
-    /// of which those with a set bit are zero; one from 0x80 for n + 7 bytes and a zero; 0xFF for 134 bytes.
-    fn decoded_backwards(mut each: impl FnMut(u8) -> bool) {
-        // The newest byte is the frame's end mark.
-        if newest(0) != Some(0) {
-            return;
-        }
-        let mut index = 1;
-        while index < LONGEST_FRAME {
-            let Some(code) = newest(index).filter(|code| *code != 0) else {
-                return;
-            };
-            index += 1;
-            let long = code & 0x80 != 0;
-            if long && code != 0xFF && !each(0) {
-                return;
-            }
-            let count = if long { code & 0x7F } else { 0 } + 7;
-            for place in 0..count {
-                let zero = !long && code >> (6 - place) & 1 != 0;
-                let byte = if zero {
-                    0
-                } else {
-                    let Some(byte) = newest(index).filter(|byte| *byte != 0) else {
-                        return;
-                    };
-                    index += 1;
-                    byte
-                };
-                if !each(byte) {
-                    return;
-                }
-            }
-        }
-    }
-
-    /// The text of the panic that was printed last, or nothing.
-    pub fn last_panic() -> impl Iterator<Item = u8> {
-        // The whole text backwards first: its start is found last.
-        let mut reversed = heapless::Vec::<u8, LONGEST_FRAME>::new();
-        decoded_backwards(|byte| reversed.push(byte).is_ok());
-        reversed.reverse();
-        let start = reversed
-            .windows(START.len())
-            .position(|window| window == START);
-        let skip = start.map_or(reversed.len(), |start| start + START.len());
-        // A print ends with a mark that UTF-8 never has.
-        reversed
-            .into_iter()
-            .skip(skip)
-            .take_while(|byte| *byte != 0xFF)
-    }
 }

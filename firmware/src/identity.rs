@@ -23,18 +23,14 @@ const SAVE_LATENCY: Duration = Duration::from_ticks(1_000_000);
 /// The identity frames' content.
 pub fn identity(previous: &Previous) -> Identity {
     Identity {
-        version: [
-            number(env!("CARGO_PKG_VERSION_MAJOR")),
-            number(env!("CARGO_PKG_VERSION_MINOR")),
-            number(env!("CARGO_PKG_VERSION_PATCH")),
-        ],
+        version: [MAJOR, MINOR, PATCH].map(|part| part.to_le_bytes()[0]),
         reset_cause: can_cause(previous.cause),
         boots: previous.resets,
-        commit: hexadecimal(env!("HALLMARK_COMMIT")),
+        commit: COMMIT,
         modified: !env!("HALLMARK_MODIFIED").is_empty(),
         configuration_crc: 0,
-        panic_hash: previous.fault_hash(),
-        panic_line: previous.panic_line(),
+        panic_hash: previous.fault_hash,
+        panic_line: previous.panic_line,
         late_tasks: previous.late_tasks,
         unique_id: unique_id(),
         uptime: Duration::from_ticks(0),
@@ -135,11 +131,23 @@ fn unique_id() -> [u32; 3] {
     ]
 }
 
-/// A number of the package's version.
-fn number(text: &str) -> u8 {
-    text.parse().unwrap_or(0)
+/// The number that a text of digits stands for; worked out when the image is built.
+const fn number(text: &str, radix: u32) -> u32 {
+    let mut rest = text.as_bytes();
+    let mut number = 0_u32;
+    while let [digit, later @ ..] = rest {
+        let digit = match digit.to_ascii_lowercase() {
+            digit @ b'0'..=b'9' => digit - b'0',
+            digit @ b'a'..=b'f' => digit - b'a' + 10,
+            _ => return 0,
+        };
+        number = number.wrapping_mul(radix).wrapping_add(digit as u32);
+        rest = later;
+    }
+    number
 }
 
-fn hexadecimal(text: &str) -> u32 {
-    u32::from_str_radix(text, 16).unwrap_or(0)
-}
+const MAJOR: u32 = number(env!("CARGO_PKG_VERSION_MAJOR"), 10);
+const MINOR: u32 = number(env!("CARGO_PKG_VERSION_MINOR"), 10);
+const PATCH: u32 = number(env!("CARGO_PKG_VERSION_PATCH"), 10);
+const COMMIT: u32 = number(env!("HALLMARK_COMMIT"), 16);

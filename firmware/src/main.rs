@@ -8,13 +8,13 @@
 )]
 
 use defmt_rtt as _;
-use panic_probe as _;
 use rtic_monotonics::systick::prelude::*;
 
 mod analog;
 mod board;
 mod can_bus;
 mod center;
+mod clock;
 mod converter;
 mod fault;
 mod flash;
@@ -67,6 +67,7 @@ mod app {
         analog::Analog,
         board::{self, Board, Edges, MeterLine},
         center::{Center, MeterLink},
+        clock,
         converter::{Converter, Progress},
         identity,
         inputs::Lines,
@@ -160,7 +161,7 @@ mod app {
         let store = ConfigurationStore::default();
         let configuration = *store.active();
         let board = Board::start(cx.device, &configuration);
-        Mono::start(cx.core.SYST, board::CORE_HZ);
+        Mono::start(cx.core.SYST, clock::CORE_HZ);
         // SAFETY: the exception is not enabled for anybody yet. Below the range edge: the timer queue's work must not
         // delay a time stamp. 4 of RTIC's priorities are the top 4 of the 16.
         unsafe {
@@ -234,9 +235,10 @@ mod app {
         );
         if let Some(fault) = previous.fault {
             defmt::error!(
-                "last run ended with {}: {=str}",
+                "last run ended with {}: {=[u8]:a}:{=u32}",
                 fault,
-                previous.panic_text()
+                previous.panic_file,
+                previous.panic_line
             );
         }
     }
@@ -316,12 +318,12 @@ mod app {
         }
         if meter.is_fresh() {
             cx.shared.meter_link.lock(|link| link.in_self_test = true);
-            if let Some(test) = meter.start_self_test() {
+            if let Some(start) = meter.start_self_test() {
                 for _ in 0..meter::SELF_TEST_MS / 10 {
                     Mono::delay(10.millis()).await;
                     alive(Task::Meter);
                 }
-                meter.finish_self_test(test);
+                meter.finish_self_test(start);
             }
         }
         cx.shared.meter_link.lock(|link| link.in_self_test = false);
@@ -331,12 +333,19 @@ mod app {
         let (mut edge, mut interrupt, mut verify, mut poll) = (false, false, true, true);
         let (mut convert, mut fetch) = (false, false);
         let mut edge_at = None;
+        // A storm's beginning and end have snapshots of their own, so that the time without edges stands alone.
+        let (mut bound, mut storms_seen) = (false, 0);
         loop {
             let now = time::now();
             let events = METER_EVENTS.swap(0, Ordering::AcqRel);
             if events & event::EDGE != 0 {
                 edge = true;
-                edge_at = edge_at.or(cx.shared.edges.lock(|edges| edges.history(now).last_edge));
+                let (last_edge, storms) = cx
+                    .shared
+                    .edges
+                    .lock(|edges| (edges.history(now).last_edge, edges.storms()));
+                edge_at = edge_at.or(last_edge);
+                bound |= core::mem::replace(&mut storms_seen, storms) != storms;
             }
             interrupt |= events & event::IRQ != 0;
             let (bridge, config) = cx.shared.meter_link.lock(|link| (link.bridge, link.config));
@@ -347,7 +356,7 @@ mod app {
             edge &= meter.is_counting();
             edge_at = edge_at.filter(|_| edge);
             let mut worked = true;
-            if edge && meter.may_snapshot(now) {
+            if edge && (core::mem::take(&mut bound) || meter.may_snapshot(now)) {
                 edge = false;
                 meter.snapshot(|at| cx.shared.edges.lock(|edges| edges.history(at)), bridge);
                 publish(meter, &mut cx.shared.meter_link, edge_at.take());
@@ -396,6 +405,7 @@ mod app {
 
             let masked = cx.shared.edges.lock(|edges| edges.is_masked());
             let until = if edge || masked {
+                // The rest after a storm ends 1 … 2 ms after its beginning.
                 Mono::now() + 1.millis()
             } else {
                 next_poll
@@ -415,6 +425,7 @@ mod app {
                 });
             cx.shared.meter_link.lock(|link| link.storms = storms);
             edge |= found;
+            bound |= found;
             interrupt |= irq;
             if Mono::now() >= next_poll {
                 (verify, poll) = (true, true);
@@ -595,7 +606,8 @@ mod app {
             }
             let now = time::now();
             if server.ends_at().is_some_and(|end| now >= end) {
-                let mut readings = readings(&mut cx, &server, last_command);
+                let mut readings = Readings::default();
+                fill(&mut cx, &server, last_command, &mut readings);
                 let served = cx.shared.administration.lock(|administration| {
                     readings.configuration_generation = administration.store.generation();
                     readings.configuration_crc = administration.store.crc();
@@ -682,17 +694,19 @@ mod app {
             .lock(|storm| *storm = active.meter_line_storm);
     }
 
-    /// A snapshot of everything that a client can read.
-    fn readings(cx: &mut rs485::Context<'_>, server: &Server, last_command: u16) -> Readings {
+    /// Fills in what a client can read, but for the configuration.
+    fn fill(
+        cx: &mut rs485::Context<'_>,
+        server: &Server,
+        last_command: u16,
+        readings: &mut Readings,
+    ) {
         let now = time::now();
-        let mut readings = Readings {
-            last_command,
-            ..Readings::default()
-        };
+        readings.last_command = last_command;
         let link = cx.shared.meter_link.lock(|link| *link);
         cx.shared.center.lock(|center| {
-            center.fill(&mut readings);
-            identity::fill(&center.identity, &mut readings);
+            center.fill(readings);
+            identity::fill(&center.identity, readings);
             let free = usize::try_from(center.identity.stack_free).unwrap_or(0);
             readings.stack_high_water =
                 u32::try_from(stack::BYTES.saturating_sub(free)).unwrap_or(u32::MAX);
@@ -719,7 +733,6 @@ mod app {
             counters.missed,
             counters.character_gaps,
         ];
-        readings
     }
 
     /// Carries an order out, or hands it to the storage task.

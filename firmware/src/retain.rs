@@ -6,9 +6,10 @@
 //! | 1 | resets since the memory was last lost |
 //! | 2 | how far the start got, and the tasks that were late when the watchdog was last refused |
 //! | 3 … 6 | fault record: magic and kind, program counter, link register, configurable fault status |
-//! | 7 | bytes of the last panic's text |
+//! | 7 | line of the last panic, 0 without one |
 //! | 8 … 55 | the two slots of `core_logic::retained` |
-//! | 56 … 127 | text of the last panic |
+//! | 56 | CRC-32 of the last panic's file name |
+//! | 57 … 72 | end of that name, in bytes |
 //!
 //! Every word is an atomic of its own, so the fault handler may write whatever it interrupted.
 
@@ -32,14 +33,15 @@ const FAULT: usize = 3;
 const FAULT_PC: usize = 4;
 const FAULT_LR: usize = 5;
 const FAULT_STATUS: usize = 6;
-const TEXT_LENGTH: usize = 7;
+const PANIC_LINE: usize = 7;
 const SLOTS: usize = 8;
-const TEXT: usize = SLOTS + 2 * SLOT_WORDS;
+const PANIC_FILE_CRC: usize = SLOTS + 2 * SLOT_WORDS;
+const PANIC_FILE: usize = PANIC_FILE_CRC + 1;
 
-/// Bytes of a panic's text that are kept: the location and most messages.
-pub const TEXT_BYTES: usize = (WORDS - TEXT) * 4;
+/// Words of the file's name that are kept, from its end: crate, module and file.
+const FILE_WORDS: usize = 16;
 
-const LAYOUT_MAGIC: u32 = 0x4841_4C03;
+const LAYOUT_MAGIC: u32 = 0x4841_4C04;
 const FAULT_MAGIC: u32 = 0xFA17_0000;
 
 fn get(index: usize) -> u32 {
@@ -171,42 +173,12 @@ pub struct Previous {
     pub late_tasks: u8,
     /// A fault, if one stopped it.
     pub fault: Option<Fault>,
-    /// Text of a panic.
-    text: [u8; TEXT_BYTES],
-    text_length: usize,
-}
-
-impl Previous {
-    /// The panic's location and the beginning of its message; empty without one.
-    pub fn panic_text(&self) -> &str {
-        let bytes = self.text.get(..self.text_length).unwrap_or_default();
-        match core::str::from_utf8(bytes) {
-            Ok(text) => text,
-            // Cut in the middle of a character.
-            Err(error) => bytes
-                .get(..error.valid_up_to())
-                .and_then(|valid| core::str::from_utf8(valid).ok())
-                .unwrap_or_default(),
-        }
-    }
-
     /// CRC-32 of the panic's file name, or where a fault stopped the program; 0 without either.
-    pub fn fault_hash(&self) -> u32 {
-        let Some(fault) = self.fault else { return 0 };
-        match self.panic_text().split(':').next() {
-            Some(file) if !file.is_empty() => CHECKSUM.checksum(file.as_bytes()),
-            _ => fault.pc,
-        }
-    }
-
+    pub fault_hash: u32,
     /// Line of the panic; 0 without one.
-    pub fn panic_line(&self) -> u32 {
-        self.panic_text()
-            .split(':')
-            .nth(1)
-            .and_then(|line| line.parse().ok())
-            .unwrap_or(0)
-    }
+    pub panic_line: u32,
+    /// The end of the panic's file name, with zeros before it; zeros without a panic.
+    pub panic_file: [u8; FILE_WORDS * 4],
 }
 
 const CHECKSUM: Crc<u32, NoTable> = Crc::<u32, NoTable>::new(&CRC_32_ISO_HDLC);
@@ -238,25 +210,30 @@ pub fn begin(cause: ResetCause) -> Previous {
             lr: get(FAULT_LR),
             status: get(FAULT_STATUS),
         });
-    let mut text = [0; TEXT_BYTES];
-    for (index, chunk) in text.as_chunks_mut::<4>().0.iter_mut().enumerate() {
-        *chunk = get(TEXT + index).to_le_bytes();
+    let line = get(PANIC_LINE);
+    let is_panic = fault.is_some_and(|fault| fault.kind == FaultKind::Panic) && line != 0;
+    let mut panic_file = [0; FILE_WORDS * 4];
+    if is_panic {
+        for (index, chunk) in panic_file.as_chunks_mut::<4>().0.iter_mut().enumerate() {
+            *chunk = get(PANIC_FILE + index).to_le_bytes();
+        }
     }
-    let is_panic = fault.is_some_and(|fault| fault.kind == FaultKind::Panic);
-    let text_length = usize::try_from(get(TEXT_LENGTH))
-        .unwrap_or(0)
-        .min(TEXT_BYTES);
     let previous = Previous {
         cause,
         resets: get(RESETS),
         stage,
         late_tasks,
         fault,
-        text,
-        text_length: if is_panic { text_length } else { 0 },
+        fault_hash: if is_panic {
+            get(PANIC_FILE_CRC)
+        } else {
+            fault.map_or(0, |fault| fault.pc)
+        },
+        panic_line: if is_panic { line } else { 0 },
+        panic_file,
     };
     set(FAULT, 0);
-    set(TEXT_LENGTH, 0);
+    set(PANIC_LINE, 0);
     set(PROGRESS, 0);
     previous
 }
@@ -282,18 +259,26 @@ pub fn note_fault(fault: Fault) {
     set(FAULT, FAULT_MAGIC | fault.kind as u32);
 }
 
-/// Notes a panic's text.
-pub fn note_text(bytes: impl Iterator<Item = u8>) {
-    let mut length = 0;
-    let mut word = [0; 4];
-    for byte in bytes.take(TEXT_BYTES) {
-        if let Some(place) = word.get_mut(length % 4) {
-            *place = byte;
-        }
-        set(TEXT + length / 4, u32::from_le_bytes(word));
-        length += 1;
+/// Notes where a panic happened; the first one counts. Whether this was the first.
+#[cfg_attr(
+    debug_assertions,
+    expect(dead_code, reason = "panic-probe handles the panics of a debug build")
+)]
+pub fn note_panic(file: &str, line: u32) -> bool {
+    if get(PANIC_LINE) != 0 {
+        return false;
     }
-    set(TEXT_LENGTH, u32::try_from(length).unwrap_or(0));
+    let mut end = file.as_bytes().iter().rev();
+    for index in (PANIC_FILE..PANIC_FILE + FILE_WORDS).rev() {
+        let mut word = 0;
+        for _ in 0..4 {
+            word = word << 8 | u32::from(end.next().copied().unwrap_or(0));
+        }
+        set(index, word);
+    }
+    set(PANIC_FILE_CRC, CHECKSUM.checksum(file.as_bytes()));
+    set(PANIC_LINE, line);
+    true
 }
 
 /// Where a slot begins.

@@ -1,10 +1,13 @@
 //! What is in the flash: configuration, charge and the log, each in its own region, by sequential-storage.
 //!
-//! | region | content | kept as |
+//! | region | content | its newest record is read at |
 //! |---|---|---|
-//! | 0x00_0000 … 0x00_4000 | configuration record | map, key 0 |
-//! | 0x01_0000 … 0x02_0000 | retained state | map, key 0 |
-//! | 0x20_0000 … 0x40_0000 | log | queue, the oldest sector is overwritten |
+//! | 0x00_0000 … 0x00_4000 | configuration record | the start, and "restore" |
+//! | 0x01_0000 … 0x02_0000 | retained state | the start |
+//! | 0x20_0000 … 0x40_0000 | log | |
+//!
+//! Each is a queue that overwrites its oldest sector. A map would find the newest record without passing the older
+//! ones, at most 0.1 s once, and cost 3 kB of code for it.
 //!
 //! A loss of power in any write leaves the old or the new item (sequential-storage's own guarantee); each record has a
 //! CRC-32 of `core_logic` besides. Everything here runs at priority 1 and waits asynchronously.
@@ -19,7 +22,6 @@ use embedded_storage_async::nor_flash::{NorFlash, ReadNorFlash};
 use sequential_storage::{
     Error,
     cache::Cache,
-    map::{MapConfig, MapStorage},
     queue::{QueueConfig, QueueStorage},
 };
 use stm32f4xx_hal::{
@@ -34,10 +36,6 @@ type Chip = Flash<spi::Device<SPI2, PB12<Output>>>;
 const CONFIGURATION: Range<u32> = 0x00_0000..0x00_4000;
 const STATE: Range<u32> = 0x01_0000..0x02_0000;
 const LOG: Range<u32> = 0x20_0000..0x40_0000;
-/// The only key of either map.
-const KEY: u8 = 0;
-/// Longest record with its key.
-const BUFFER: usize = MAX_RECORD + 8;
 
 /// What happened since the start; each stops at its end.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -71,7 +69,7 @@ pub enum Stored<T> {
 /// The flash with its regions.
 pub struct Storage {
     flash: Chip,
-    buffer: [u8; BUFFER],
+    buffer: [u8; MAX_RECORD],
     record: [u8; MAX_RECORD],
     counters: Counters,
     ready: bool,
@@ -85,7 +83,7 @@ impl Storage {
     pub fn new(spi: spi::Device<SPI2, PB12<Output>>) -> Self {
         Self {
             flash: Flash::new(spi),
-            buffer: [0; BUFFER],
+            buffer: [0; MAX_RECORD],
             record: [0; MAX_RECORD],
             counters: Counters::default(),
             ready: false,
@@ -121,7 +119,7 @@ impl Storage {
 
     /// The stored configuration.
     pub async fn configuration(&mut self) -> Stored<Configuration> {
-        match self.fetch(CONFIGURATION).await {
+        match self.newest(CONFIGURATION).await {
             Ok(Some(bytes)) => match configuration::decode(bytes) {
                 Ok(configuration) => Stored::Value(configuration),
                 Err(error) => {
@@ -150,7 +148,7 @@ impl Storage {
 
     /// The stored charge and state of charge.
     pub async fn state(&mut self) -> Stored<RetainedState> {
-        match self.fetch(STATE).await {
+        match self.newest(STATE).await {
             Ok(Some(bytes)) => match RetainedState::decode(bytes) {
                 Ok(state) => Stored::Value(state),
                 Err(error) => {
@@ -164,17 +162,25 @@ impl Storage {
         }
     }
 
-    async fn fetch(&mut self, region: Range<u32>) -> Result<Option<&[u8]>, ()> {
-        if !self.ready {
-            return Err(());
-        }
-        let Some(config) = MapConfig::try_new(region).ok() else {
+    async fn newest(&mut self, region: Range<u32>) -> Result<Option<&[u8]>, ()> {
+        let (Ok(config), true) = (QueueConfig::try_new(region), self.ready) else {
             return Err(());
         };
-        let mut map = MapStorage::<u8, _, _>::new(&mut self.flash, config, Cache::new_uncached());
-        map.fetch_item::<&[u8]>(&mut self.buffer, &KEY)
+        let mut queue = QueueStorage::new(&mut self.flash, config, Cache::new_uncached());
+        let mut length = None;
+        let mut items = queue.iter().await.map_err(|error| log(&error))?;
+        // A record that was cut off by a loss of power has a wrong CRC and is passed over.
+        while let Some(item) = items
+            .next(&mut self.buffer)
             .await
-            .map_err(|error| log(&error))
+            .map_err(|error| log(&error))?
+        {
+            length = Some(item.len());
+            for (to, from) in self.record.iter_mut().zip(item.iter()) {
+                *to = *from;
+            }
+        }
+        Ok(length.and_then(|length| self.record.get(..length)))
     }
 
     /// Writes the configuration; whether it is in the flash.
@@ -183,7 +189,7 @@ impl Storage {
             return false;
         };
         let length = record.len();
-        self.store(CONFIGURATION, length).await
+        self.push(CONFIGURATION, length).await.is_ok()
     }
 
     /// Writes charge and state of charge; whether they are in the flash.
@@ -195,53 +201,58 @@ impl Storage {
             return false;
         };
         let length = record.len();
-        self.store(STATE, length).await
+        self.push(STATE, length).await.is_ok()
     }
 
-    /// Writes the first `length` bytes of `record`.
-    async fn store(&mut self, region: Range<u32>, length: usize) -> bool {
-        let (Some(record), true) = (self.record.get(..length), self.ready) else {
-            return false;
+    /// Writes the first `length` bytes of `record`; whether the oldest sector had to be given up for it.
+    async fn push(&mut self, region: Range<u32>, length: usize) -> Result<bool, ()> {
+        let (Some(record), Ok(config), true) = (
+            self.record.get(..length),
+            QueueConfig::try_new(region),
+            self.ready,
+        ) else {
+            return Err(());
         };
-        let Some(config) = MapConfig::try_new(region).ok() else {
-            return false;
+        let mut queue = QueueStorage::new(&mut self.flash, config, Cache::new_uncached());
+        let mut full = false;
+        let result = loop {
+            let result = queue.push(record, full).await;
+            if full || !matches!(result, Err(Error::FullStorage)) {
+                break result;
+            }
+            full = true;
         };
-        let mut map = MapStorage::<u8, _, _>::new(&mut self.flash, config, Cache::new_uncached());
-        let result = map
-            .store_item::<&[u8]>(&mut self.buffer, &KEY, &record)
-            .await;
-        self.note(result.map_err(|error| log(&error)))
-    }
-
-    fn note(&mut self, result: Result<(), ()>) -> bool {
         match result {
-            Ok(()) => count(&mut self.counters.written),
-            Err(()) => {
+            Ok(()) => {
+                count(&mut self.counters.written);
+                Ok(full)
+            }
+            Err(error) => {
+                log(&error);
                 count(&mut self.counters.failures);
                 self.failed = true;
+                Err(())
             }
         }
-        result.is_ok()
     }
 
     /// Appends to the log, over its oldest records when it is full.
     pub async fn append(&mut self, record: &LogRecord) {
-        let mut buffer = [0; MAX_LOG_BYTES];
-        let (Ok(bytes), true) = (record.encode(&mut buffer), self.ready) else {
-            count(&mut self.counters.lost);
-            return;
+        let length = self
+            .record
+            .get_mut(..MAX_LOG_BYTES)
+            .and_then(|buffer| record.encode(buffer).ok())
+            .map(|bytes| bytes.len());
+        let result = match length {
+            Some(length) => self.push(LOG, length).await,
+            None => Err(()),
         };
-        let Some(config) = QueueConfig::try_new(LOG).ok() else {
-            return;
-        };
-        let mut queue = QueueStorage::new(&mut self.flash, config, Cache::new_uncached());
-        let mut result = queue.push(bytes, self.log_full).await;
-        if matches!(result, Err(Error::FullStorage)) {
-            (self.log_full, self.overwrites) = (true, true);
-            result = queue.push(bytes, true).await;
-        }
-        if !self.note(result.map_err(|error| log(&error))) {
-            count(&mut self.counters.lost);
+        match result {
+            Ok(full) => {
+                self.overwrites |= full && !self.log_full;
+                self.log_full |= full;
+            }
+            Err(()) => count(&mut self.counters.lost),
         }
     }
 

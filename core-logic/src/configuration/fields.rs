@@ -43,9 +43,9 @@ pub struct Field {
     pub min: i64,
     /// Largest value.
     pub max: i64,
-    /// The value of an element; `None` when it belongs to another front end than the one set.
-    pub get: fn(&Configuration, usize) -> Option<i64>,
-    set: fn(&mut Configuration, usize, i64) -> bool,
+    /// Where an element is kept; one function for reading and writing, as there is one for every row. `None` when it
+    /// belongs to another front end than the one set.
+    place: fn(&mut Configuration, usize) -> Option<&mut dyn Setting>,
 }
 
 impl Row for Field {
@@ -60,6 +60,18 @@ impl Field {
             address: self.layout.address,
             element,
         }
+    }
+
+    /// The value of an element; `None` when it belongs to another front end than the one set.
+    #[must_use]
+    pub fn get(&self, configuration: &Configuration, element: usize) -> Option<i64> {
+        let mut copy = *configuration;
+        self.get_in(&mut copy, element)
+    }
+
+    /// As [`Field::get`], from a configuration that the caller may change; it is not changed.
+    pub(crate) fn get_in(&self, configuration: &mut Configuration, element: usize) -> Option<i64> {
+        (self.place)(configuration, element).map(|setting| setting.read())
     }
 
     /// Whether `value` lies in the limits of this field.
@@ -90,7 +102,7 @@ impl Field {
         value: i64,
     ) -> Result<(), Violation> {
         self.check(element, value)?;
-        if (self.set)(configuration, element, value) {
+        if (self.place)(configuration, element).is_some_and(|setting| setting.write(value)) {
             configuration.derive();
             Ok(())
         } else {
@@ -127,8 +139,49 @@ impl fmt::Display for FieldId {
     }
 }
 
-/// What a setting is made of, as the number in the register map.
-trait Setting: Sized {
+/// A setting as the number in the register map.
+trait Setting {
+    fn read(&self) -> i64;
+    /// Whether such a value exists; if not, the setting stays as it is.
+    fn write(&mut self, number: i64) -> bool;
+}
+
+impl<T: Value> Setting for T {
+    fn read(&self) -> i64 {
+        self.number()
+    }
+    fn write(&mut self, number: i64) -> bool {
+        assign(self, number)
+    }
+}
+
+impl Setting for FrontEnd {
+    fn read(&self) -> i64 {
+        match self {
+            Self::DualRange(_) => 0,
+            Self::Hah1bv(_) => 1,
+            Self::Network(_) => 2,
+            Self::ClosedLoop(_) => 3,
+        }
+    }
+    /// Another front end comes with its own defaults; the same one keeps its values.
+    fn write(&mut self, number: i64) -> bool {
+        if number == self.read() {
+            return true;
+        }
+        *self = match number {
+            0 => Self::DualRange(DualRange::default()),
+            1 => Self::Hah1bv(Hah1bv::default()),
+            2 => Self::Network(Network::default()),
+            3 => Self::ClosedLoop(ClosedLoop::default()),
+            _ => return false,
+        };
+        true
+    }
+}
+
+/// What a setting is made of.
+trait Value: Sized {
     fn number(&self) -> i64;
     /// `None` when no such value exists.
     fn from_number(number: i64) -> Option<Self>;
@@ -136,7 +189,7 @@ trait Setting: Sized {
 
 macro_rules! settings {
     ($($integer:ty),*; $($quantity:ident),*) => {
-        $(impl Setting for $integer {
+        $(impl Value for $integer {
             fn number(&self) -> i64 {
                 i64::from(*self)
             }
@@ -144,7 +197,7 @@ macro_rules! settings {
                 number.try_into().ok()
             }
         })*
-        $(impl Setting for $quantity {
+        $(impl Value for $quantity {
             fn number(&self) -> i64 {
                 self.get().into()
             }
@@ -157,7 +210,7 @@ macro_rules! settings {
 settings!(u8, u16, u32, i32, i64; Microamps, Microvolts, Millivolts, Nanocoulombs, MilliCelsius, Ppm);
 
 /// 0 stands for none.
-impl<T: Setting> Setting for Option<T> {
+impl<T: Value> Value for Option<T> {
     fn number(&self) -> i64 {
         self.as_ref().map_or(0, T::number)
     }
@@ -169,7 +222,7 @@ impl<T: Setting> Setting for Option<T> {
     }
 }
 
-impl Setting for bool {
+impl Value for bool {
     fn number(&self) -> i64 {
         i64::from(*self)
     }
@@ -185,7 +238,7 @@ impl Setting for bool {
 /// Enumerations are numbered in the order of their variants.
 macro_rules! choices {
     ($($name:path: $($variant:ident),*;)*) => {
-        $(impl Setting for $name {
+        $(impl Value for $name {
             fn number(&self) -> i64 {
                 *self as i64
             }
@@ -202,21 +255,13 @@ choices! {
     key_calibration::OnFailure: PermitWithPrevious, Hold;
 }
 
-fn assign<T: Setting>(place: &mut T, number: i64) -> bool {
+fn assign<T: Value>(place: &mut T, number: i64) -> bool {
     match T::from_number(number) {
         Some(value) => {
             *place = value;
             true
         }
         None => false,
-    }
-}
-
-fn of_range<T>(values: &PerRange<T>, element: usize) -> Option<&T> {
-    match element {
-        0 => Some(&values.small),
-        1 => Some(&values.large),
-        _ => None,
     }
 }
 
@@ -228,39 +273,20 @@ fn of_range_mut<T>(values: &mut PerRange<T>, element: usize) -> Option<&mut T> {
     }
 }
 
-/// The value of a setting, after how it is reached.
-macro_rules! getter {
-    ([at $($path:ident).+]) => { |c, _| Some(c.$($path).+.number()) };
-    ([ranges $($path:ident).+]) => { |c, i| of_range(&c.$($path).+, i).map(Setting::number) };
-    ([each $($path:ident).+ ; $member:ident]) => { |c, i| c.$($path).+.get(i).map(|item| item.$member.number()) };
-    ([list $($path:ident).+]) => { |c, i| c.$($path).+.get(i).map(Setting::number) };
-    ([sensor $variant:ident $($path:ident).+]) => { |c, _| match &c.front_end {
-        FrontEnd::$variant(sensor) => Some(sensor.$($path).+.number()),
+/// Where a setting is kept, after how it is reached.
+macro_rules! place {
+    ([at $($path:ident).+]) => { |c, _| Some(&mut c.$($path).+) };
+    ([ranges $($path:ident).+]) => { |c, i| Some(of_range_mut(&mut c.$($path).+, i)?) };
+    ([each $($path:ident).+ ; $member:ident]) => { |c, i| Some(&mut c.$($path).+.get_mut(i)?.$member) };
+    ([list $($path:ident).+]) => { |c, i| Some(c.$($path).+.get_mut(i)?) };
+    ([sensor $variant:ident $($path:ident).+]) => { |c, _| match &mut c.front_end {
+        FrontEnd::$variant(sensor) => Some(&mut sensor.$($path).+),
         _ => None,
     } };
-    ([sensor_ranges $variant:ident $($path:ident).+]) => { |c, i| match &c.front_end {
-        FrontEnd::$variant(sensor) => of_range(&sensor.$($path).+, i).map(Setting::number),
+    ([sensor_ranges $variant:ident $($path:ident).+]) => { |c, i| match &mut c.front_end {
+        FrontEnd::$variant(sensor) => Some(of_range_mut(&mut sensor.$($path).+, i)?),
         _ => None,
     } };
-    ([by $get:path, $set:path]) => { |c, _| Some($get(c)) };
-}
-
-macro_rules! setter {
-    ([at $($path:ident).+]) => { |c, _, v| assign(&mut c.$($path).+, v) };
-    ([ranges $($path:ident).+]) => { |c, i, v| of_range_mut(&mut c.$($path).+, i).is_some_and(|place| assign(place, v)) };
-    ([each $($path:ident).+ ; $member:ident]) => {
-        |c, i, v| c.$($path).+.get_mut(i).is_some_and(|item| assign(&mut item.$member, v))
-    };
-    ([list $($path:ident).+]) => { |c, i, v| c.$($path).+.get_mut(i).is_some_and(|place| assign(place, v)) };
-    ([sensor $variant:ident $($path:ident).+]) => { |c, _, v| match &mut c.front_end {
-        FrontEnd::$variant(sensor) => assign(&mut sensor.$($path).+, v),
-        _ => false,
-    } };
-    ([sensor_ranges $variant:ident $($path:ident).+]) => { |c, i, v| match &mut c.front_end {
-        FrontEnd::$variant(sensor) => of_range_mut(&mut sensor.$($path).+, i).is_some_and(|place| assign(place, v)),
-        _ => false,
-    } };
-    ([by $get:path, $set:path]) => { |c, _, v| $set(c, v) };
 }
 
 macro_rules! fields {
@@ -273,8 +299,7 @@ macro_rules! fields {
                 when: When::$when,
                 min: $min as i64,
                 max: $max as i64,
-                get: getter!($access),
-                set: setter!($access),
+                place: place!($access),
             },)*
         ];
         /// What [`FIELDS`] mean, row by row.
@@ -284,30 +309,6 @@ macro_rules! fields {
     };
 }
 
-fn front_end(configuration: &Configuration) -> i64 {
-    match configuration.front_end {
-        FrontEnd::DualRange(_) => 0,
-        FrontEnd::Hah1bv(_) => 1,
-        FrontEnd::Network(_) => 2,
-        FrontEnd::ClosedLoop(_) => 3,
-    }
-}
-
-/// Another front end comes with its own defaults; the same one keeps its values.
-fn set_front_end(configuration: &mut Configuration, number: i64) -> bool {
-    if number == front_end(configuration) {
-        return true;
-    }
-    configuration.front_end = match number {
-        0 => FrontEnd::DualRange(DualRange::default()),
-        1 => FrontEnd::Hah1bv(Hah1bv::default()),
-        2 => FrontEnd::Network(Network::default()),
-        3 => FrontEnd::ClosedLoop(ClosedLoop::default()),
-        _ => return false,
-    };
-    true
-}
-
 /// Largest full scale of any sensor here.
 const FULL_SCALE: (i32, i32) = (
     front_end::FULL_SCALE_LIMITS.0.get(),
@@ -315,7 +316,7 @@ const FULL_SCALE: (i32, i32) = (
 );
 
 fields! {
-    0x0100 U16 1 Standstill (0, 3) "front end" "" "0 dual range (D0), 1 HAH1BV (D2), 2 network (D3), 3 closed loop (D4); another one than before comes with its defaults" [by front_end, set_front_end];
+    0x0100 U16 1 Standstill (0, 3) "front end" "" "0 dual range (D0), 1 HAH1BV (D2), 2 network (D3), 3 closed loop (D4); another one than before comes with its defaults" [at front_end];
     0x0102 I32 2 Standstill (FULL_SCALE.0, FULL_SCALE.1) "dual range: full scale" "µA" "small and large sensor" [sensor_ranges DualRange full_scale];
     0x0106 I32 1 Standstill (1_000_000, 2_500_000) "dual range: swing" "µV" "output from 0 A to the end of the range" [sensor DualRange swing];
     0x0108 I32 1 Standstill (1_000_000, 4_000_000) "dual range: zero" "µV" "output at 0 A" [sensor DualRange zero];
@@ -492,11 +493,11 @@ mod tests {
         assert!(assign(&mut place, 255));
         assert_eq!(place, 255);
         let mut configuration = Configuration::default();
-        assert!(!set_front_end(&mut configuration, 4));
+        assert!(!configuration.front_end.write(4));
         assert_eq!(configuration, Configuration::default());
         let mut both = PerRange { small: 1, large: 2 };
         assert_eq!(
-            [0, 1, 2].map(|i| of_range(&both, i).copied()),
+            [0, 1, 2].map(|i| of_range_mut(&mut both, i).copied()),
             [Some(1), Some(2), None]
         );
         *of_range_mut(&mut both, 1).unwrap() = 9;

@@ -71,7 +71,7 @@ impl Kind {
     )]
     pub fn word(self, value: i64, word: u16) -> u16 {
         let shift = self.width().saturating_sub(1).saturating_sub(word) * 16;
-        (value.clamp(self.min(), self.max()) >> shift) as u16
+        (value.min(self.max()).max(self.min()) >> shift) as u16
     }
 
     /// The value whose two's complement the low bits of `bits` are, all the words shifted in.

@@ -160,7 +160,7 @@ impl<'a> HostBoard<'a> {
             &history,
             now,
         );
-        if at_us % 100_000 == 0 && self.vehicle.voltage_fresh {
+        if at_us.is_multiple_of(100_000) && self.vehicle.voltage_fresh {
             self.measurement.on_battery_voltage(
                 &can::BatteryVoltage {
                     cell: Some(Microvolts((self.world.row().cell_v * 1e6) as i32)),
@@ -193,7 +193,7 @@ impl<'a> HostBoard<'a> {
             self.sender
                 .current_average(&self.measurement.current_average(&self.configuration)),
         );
-        if tick_us % 100_000 == 0 {
+        if tick_us.is_multiple_of(100_000) {
             send(self.sender.charge(&self.measurement.charge()));
             send(self.sender.meter_current(&self.measurement.meter_current()));
             send(
@@ -203,7 +203,7 @@ impl<'a> HostBoard<'a> {
             send(self.measurement.environment().encode());
             send(self.measurement.board_state(0, 0).encode());
         }
-        if tick_us % 1_000_000 == 0 {
+        if tick_us.is_multiple_of(1_000_000) {
             send(self.measurement.throughput().encode());
             send(can::diagnosis_active(self.measurement.diagnosis().active()));
         }

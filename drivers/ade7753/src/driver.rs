@@ -7,8 +7,8 @@ use embedded_hal::spi::Operation;
 use crate::config::Config;
 use crate::error::{Error, StuckLevel};
 use crate::registers::{
-    Aenergy, Cfnum, Ch1os, ClearedByRead, Dierev, EnergyDelta, Gain, Interrupts, Mode,
-    NonDestructive, Register, RegisterId, Rststatus, Status, Temp, Waveform, Width, Writable,
+    Aenergy, Cfnum, Ch1os, Ch2os, ClearedByRead, Dierev, EnergyDelta, Gain, Interrupts, Irqen,
+    Mode, NonDestructive, Register, RegisterId, Rststatus, Status, Temp, Waveform, Width, Writable,
 };
 use crate::timing::Timing;
 use crate::transport::Transport;
@@ -95,12 +95,50 @@ pub struct OffsetTest {
     start: Aenergy,
 }
 
+/// A register as the transfers see it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Field {
+    register: RegisterId,
+    width: Width,
+    verify_mask: u32,
+}
+
+impl Field {
+    pub(crate) const fn of<R: NonDestructive>() -> Self {
+        Self {
+            register: R::ID,
+            width: R::WIDTH,
+            verify_mask: u32::MAX,
+        }
+    }
+
+    pub(crate) const fn cleared<R: ClearedByRead>() -> Self {
+        Self {
+            register: R::ID,
+            width: R::WIDTH,
+            verify_mask: u32::MAX,
+        }
+    }
+
+    pub(crate) const fn writable<R: Writable>() -> Self {
+        Self {
+            verify_mask: R::VERIFY_MASK,
+            ..Self::of::<R>()
+        }
+    }
+}
+
+const MODE: Field = Field::writable::<Mode>();
+
 #[derive(Debug)]
 pub(crate) struct Core<T> {
     pub(crate) transport: T,
     pub(crate) options: Options,
     pub(crate) statistics: Statistics,
-    config: Option<Config>,
+    /// The last one given to `configure`.
+    config: Config,
+    /// Whether it is in force.
+    is_configured: bool,
     die_revision: Option<Dierev>,
     offset_test: bool,
 }
@@ -111,14 +149,15 @@ impl<T> Core<T> {
             transport,
             options,
             statistics: Statistics::default(),
-            config: None,
+            config: Config::DC,
+            is_configured: false,
             die_revision: None,
             offset_test: false,
         }
     }
 
     pub(crate) fn config(&self) -> Option<&Config> {
-        self.config.as_ref()
+        self.is_configured.then_some(&self.config)
     }
 
     pub(crate) fn die_revision(&self) -> Option<Dierev> {
@@ -148,6 +187,19 @@ fn check<E>(register: RegisterId, width: Width, read: u32, got: u8) -> Result<()
     }
 }
 
+/// What `configure` writes, in this order. A function and not a table: a table would live in the future.
+fn setting(config: &Config, index: u8) -> Option<(Field, Option<u32>)> {
+    Some(match index {
+        0 => (Field::writable::<Gain>(), config.gain.encode()),
+        1 => (Field::writable::<Ch1os>(), config.ch1os().encode()),
+        2 => (Field::writable::<Ch2os>(), config.ch2os().encode()),
+        3 => (Field::writable::<Cfnum>(), config.cfnum().encode()),
+        4 => (MODE, config.mode().encode()),
+        5 => (Field::writable::<Irqen>(), config.irqen().encode()),
+        _ => return None,
+    })
+}
+
 /// The number in bytes that came most significant first.
 fn from_big_endian(bytes: &[u8]) -> u32 {
     bytes
@@ -160,16 +212,9 @@ fn count(counter: &mut u32) {
 }
 
 impl<T: Transport> Core<T> {
-    async fn transfer(
-        &mut self,
-        register: RegisterId,
-        operations: &mut [Operation<'_, u8>],
-    ) -> Result<(), Error<T::Error>> {
-        let result = self.transport.transaction(operations).await;
-        result.map_err(|source| {
-            count(&mut self.statistics.bus_errors);
-            Error::Bus { register, source }
-        })
+    fn bus_error(&mut self, register: RegisterId, source: T::Error) -> Error<T::Error> {
+        count(&mut self.statistics.bus_errors);
+        Error::Bus { register, source }
     }
 
     /// One read under one chip select, unchecked.
@@ -180,36 +225,25 @@ impl<T: Transport> Core<T> {
     ) -> Result<u32, Error<T::Error>> {
         let command = [register.address()];
         let mut buffer = [0; 3];
-        let data = buffer.get_mut(..width.bytes()).unwrap_or_default();
+        let bytes = width.bytes();
         let timing = self.options.timing;
         let write = Operation::Write(&command);
         let wait = Operation::DelayNs(timing.command_to_data_ns);
         let gap = || Operation::DelayNs(timing.read_byte_gap_ns);
-        match data {
-            [high, low] if timing.read_byte_gap_ns > 0 => {
-                let high = Operation::Read(slice::from_mut(high));
-                let low = Operation::Read(slice::from_mut(low));
-                self.transfer(register, &mut [write, wait, high, gap(), low])
-                    .await?;
-            }
-            [high, middle, low] if timing.read_byte_gap_ns > 0 => {
-                let high = Operation::Read(slice::from_mut(high));
-                let middle = Operation::Read(slice::from_mut(middle));
-                let low = Operation::Read(slice::from_mut(low));
-                self.transfer(
-                    register,
-                    &mut [write, wait, high, gap(), middle, gap(), low],
-                )
-                .await?;
-            }
-            whole => {
-                self.transfer(register, &mut [write, wait, Operation::Read(whole)])
-                    .await?;
-            }
-        }
-        Ok(from_big_endian(
-            buffer.get(..width.bytes()).unwrap_or_default(),
-        ))
+        let result = if timing.read_byte_gap_ns == 0 {
+            let whole = Operation::Read(buffer.get_mut(..bytes).unwrap_or_default());
+            self.transport.transaction(&mut [write, wait, whole]).await
+        } else {
+            let [first, second, third] = buffer.each_mut().map(slice::from_mut);
+            let first = Operation::Read(first);
+            let second = Operation::Read(second);
+            let third = Operation::Read(third);
+            let mut operations = [write, wait, first, gap(), second, gap(), third];
+            let operations = operations.get_mut(..1 + 2 * bytes).unwrap_or_default();
+            self.transport.transaction(operations).await
+        };
+        result.map_err(|source| self.bus_error(register, source))?;
+        Ok(from_big_endian(buffer.get(..bytes).unwrap_or_default()))
     }
 
     /// One write under one chip select, unverified.
@@ -224,75 +258,83 @@ impl<T: Transport> Core<T> {
         let [_, _, high, low] = raw.to_be_bytes();
         let (high, low) = ([high], [low]);
         let gap = || Operation::DelayNs(self.options.timing.write_byte_gap_ns);
-        let command = Operation::Write(&command);
-        let low = Operation::Write(&low);
-        // The gap belongs to the transaction: nobody else on the bus can then shorten it.
-        let after = Operation::DelayNs(after_ns);
-        match width {
-            Width::One => {
-                let operations = &mut [command, gap(), low, after];
-                self.transfer(register, operations).await
-            }
-            // No register of 24 bits can be written.
-            Width::Two | Width::Three => {
-                let high = Operation::Write(&high);
-                let operations = &mut [command, gap(), high, gap(), low, after];
-                self.transfer(register, operations).await
-            }
-        }
+        // No register of 24 bits can be written. One of 8 bits begins with the second pair.
+        let (second, skipped) = match width {
+            Width::One => (&command, 2),
+            Width::Two | Width::Three => (&high, 0),
+        };
+        let mut operations = [
+            Operation::Write(&command),
+            gap(),
+            Operation::Write(second),
+            gap(),
+            Operation::Write(&low),
+            // This gap belongs to the transaction: nobody else on the bus can then shorten it.
+            Operation::DelayNs(after_ns),
+        ];
+        let operations = operations.get_mut(skipped..).unwrap_or_default();
+        let result = self.transport.transaction(operations).await;
+        result.map_err(|source| self.bus_error(register, source))
     }
 
     /// Data and CHKSUM, each under its own chip select, whose falling edge resynchronises the chip's interface.
+    ///
+    /// Like every transfer here it works on bits and not on a register's type: one state machine for all registers.
     async fn read_checked(
         &mut self,
         register: RegisterId,
         width: Width,
+        retries: u8,
     ) -> Result<u32, Error<T::Error>> {
-        let read = self.receive(register, width).await?;
-        let got = self.receive(RegisterId::Chksum, Width::One).await?;
-        let [got, ..] = got.to_le_bytes();
-        let result = check(register, width, read, got);
-        if result.is_err() {
-            count(&mut self.statistics.checksum_failures);
-        }
-        result.map(|()| read)
-    }
-
-    async fn read_bits<R: NonDestructive>(&mut self) -> Result<u32, Error<T::Error>> {
-        let mut retries_left = self.options.retries;
+        let mut retries_left = retries;
         loop {
-            match self.read_checked(R::ID, R::WIDTH).await {
-                Err(Error::Checksum { .. } | Error::DeadBus { .. }) if retries_left > 0 => {
-                    retries_left -= 1;
-                    count(&mut self.statistics.retries);
-                }
-                result => return result,
+            let read = self.receive(register, width).await?;
+            let got = self.receive(RegisterId::Chksum, Width::One).await?;
+            let [got, ..] = got.to_le_bytes();
+            let Err(error) = check(register, width, read, got) else {
+                return Ok(read);
+            };
+            count(&mut self.statistics.checksum_failures);
+            if retries_left == 0 {
+                return Err(error);
             }
+            retries_left -= 1;
+            count(&mut self.statistics.retries);
         }
     }
 
-    pub(crate) async fn read<R: NonDestructive>(&mut self) -> Result<R, Error<T::Error>> {
-        let read = self.read_bits::<R>().await?;
-        decoded(read)
+    /// A register that reading does not change, with retries.
+    pub(crate) async fn read_bits(&mut self, field: Field) -> Result<u32, Error<T::Error>> {
+        let retries = self.options.retries;
+        self.read_checked(field.register, field.width, retries)
+            .await
     }
 
-    pub(crate) async fn read_and_clear<R: ClearedByRead>(&mut self) -> Result<R, Error<T::Error>> {
-        let read = self.read_checked(R::ID, R::WIDTH).await?;
-        decoded(read)
+    /// A register that reading clears.
+    pub(crate) async fn take_bits(&mut self, field: Field) -> Result<u32, Error<T::Error>> {
+        self.read_checked(field.register, field.width, 0).await
     }
 
-    pub(crate) async fn write<R: Writable>(&mut self, value: R) -> Result<(), Error<T::Error>> {
-        let register = R::ID;
-        let Some(written) = value.encode() else {
+    /// Writes and verifies; `None` is a value that does not fit.
+    pub(crate) async fn write_bits(
+        &mut self,
+        field: Field,
+        written: Option<u32>,
+    ) -> Result<(), Error<T::Error>> {
+        let Field {
+            register,
+            width,
+            verify_mask,
+        } = field;
+        let Some(written) = written else {
             return Err(Error::ValueOutOfRange { register });
         };
         let after_write_ns = self.options.timing.after_write_ns;
         let mut retries_left = self.options.retries;
         loop {
-            self.send(register, R::WIDTH, written, after_write_ns)
-                .await?;
-            let read = self.read_bits::<R>().await?;
-            if (read ^ written) & R::VERIFY_MASK == 0 {
+            self.send(register, width, written, after_write_ns).await?;
+            let read = self.read_bits(field).await?;
+            if (read ^ written) & verify_mask == 0 {
                 return Ok(());
             }
             count(&mut self.statistics.verify_failures);
@@ -310,7 +352,7 @@ impl<T: Transport> Core<T> {
 
     pub(crate) async fn software_reset(&mut self) -> Result<(), Error<T::Error>> {
         // Without a configuration an offset test cannot be finished either; `configure` forgets it.
-        self.config = None;
+        self.is_configured = false;
         let after_reset_ns = self.options.timing.after_reset_ns;
         self.send(
             RegisterId::Mode,
@@ -319,7 +361,7 @@ impl<T: Transport> Core<T> {
             after_reset_ns,
         )
         .await?;
-        let read = self.read_bits::<Mode>().await?;
+        let read = self.read_bits(MODE).await?;
         if read == MODE_RESET {
             Ok(())
         } else {
@@ -331,21 +373,30 @@ impl<T: Transport> Core<T> {
         }
     }
 
-    pub(crate) async fn configure(&mut self, config: &Config) -> Result<(), Error<T::Error>> {
-        self.config = None;
+    /// Not `async` itself, so that the future holds no second configuration.
+    pub(crate) fn configure(
+        &mut self,
+        config: &Config,
+    ) -> impl Future<Output = Result<(), Error<T::Error>>> {
+        self.config = *config;
+        self.is_configured = false;
         self.offset_test = false;
-        if self.read_bits::<Mode>().await? == 0 {
+        self.write_configuration()
+    }
+
+    async fn write_configuration(&mut self) -> Result<(), Error<T::Error>> {
+        if self.read_bits(MODE).await? == 0 {
             self.check_stuck_low().await?;
         }
-        self.write(config.gain).await?;
-        self.write(config.ch1os()).await?;
-        self.write(config.ch2os()).await?;
-        self.write(config.cfnum()).await?;
-        self.write(config.mode()).await?;
-        self.write(config.irqen()).await?;
-        self.die_revision = Some(self.read().await?);
+        let mut index = 0;
+        while let Some((field, value)) = setting(&self.config, index) {
+            self.write_bits(field, value).await?;
+            index += 1;
+        }
+        let revision = self.read_bits(Field::of::<Dierev>()).await?;
+        self.die_revision = Dierev::decode(revision);
         self.clear_reset_flag().await?;
-        self.config = Some(*config);
+        self.is_configured = true;
         Ok(())
     }
 
@@ -356,7 +407,7 @@ impl<T: Transport> Core<T> {
             // The flags themselves do not matter here, so neither does their checksum.
             self.receive(RegisterId::Rststatus, Rststatus::WIDTH)
                 .await?;
-            let read = self.read_bits::<Status>().await?;
+            let read = self.read_bits(Field::of::<Status>()).await?;
             if read & u32::from(Interrupts::RESET.bits()) == 0 {
                 return Ok(());
             }
@@ -374,7 +425,9 @@ impl<T: Transport> Core<T> {
 
     /// After MODE has read 0, which no [`Config`] and no reset makes it: is it the line?
     async fn check_stuck_low(&mut self) -> Result<(), Error<T::Error>> {
-        if self.read_bits::<Cfnum>().await? == 0 && self.read_bits::<Dierev>().await? == 0 {
+        if self.read_bits(Field::of::<Cfnum>()).await? == 0
+            && self.read_bits(Field::of::<Dierev>()).await? == 0
+        {
             return Err(Error::DeadBus {
                 register: RegisterId::Mode,
                 level: StuckLevel::Low,
@@ -384,7 +437,7 @@ impl<T: Transport> Core<T> {
     }
 
     fn configured(&self) -> Result<Config, Error<T::Error>> {
-        self.config.ok_or(Error::NotConfigured)
+        self.config().copied().ok_or(Error::NotConfigured)
     }
 
     /// MODE as configured, with what a running test changes in it.
@@ -398,7 +451,7 @@ impl<T: Transport> Core<T> {
     async fn check_mode(&mut self) -> Result<Config, Error<T::Error>> {
         let config = self.configured()?;
         let expected = self.expected_mode(&config).bits().into();
-        let read = self.read_bits::<Mode>().await?;
+        let read = self.read_bits(MODE).await?;
         if (read ^ expected) & Mode::VERIFY_MASK == 0 {
             return Ok(config);
         }
@@ -415,48 +468,42 @@ impl<T: Transport> Core<T> {
         })
     }
 
-    async fn check_register<R: NonDestructive>(
-        &mut self,
-        expected: u32,
-        mask: u32,
-    ) -> Result<(), Error<T::Error>> {
-        let read = self.read_bits::<R>().await?;
-        if (read ^ expected) & mask == 0 {
-            return Ok(());
-        }
-        Err(Error::Configuration {
-            register: R::ID,
-            expected,
-            read,
-        })
-    }
-
     pub(crate) async fn verify_configuration(&mut self) -> Result<(), Error<T::Error>> {
         let config = self.check_mode().await?;
-        let gain = config.gain.bits().into();
-        self.check_register::<Gain>(gain, Gain::VERIFY_MASK).await?;
-        let ch1os = config.ch1os().bits().into();
-        self.check_register::<Ch1os>(ch1os, Ch1os::VERIFY_MASK)
-            .await?;
-        let cfnum = config.cf_numerator.get().into();
-        self.check_register::<Cfnum>(cfnum, Cfnum::VERIFY_MASK)
-            .await?;
-        if let Some(Dierev(revision)) = self.die_revision {
-            self.check_register::<Dierev>(revision.into(), 0xFF).await?;
+        for &(field, expected) in &[
+            (Field::writable::<Gain>(), config.gain.encode()),
+            (Field::writable::<Ch1os>(), config.ch1os().encode()),
+            (Field::writable::<Cfnum>(), config.cfnum().encode()),
+            (
+                Field::of::<Dierev>(),
+                self.die_revision.map(|Dierev(revision)| revision.into()),
+            ),
+        ] {
+            // What could not be encoded could not be written either.
+            let Some(expected) = expected else { continue };
+            let read = self.read_bits(field).await?;
+            if (read ^ expected) & field.verify_mask != 0 {
+                return Err(Error::Configuration {
+                    register: field.register,
+                    expected,
+                    read,
+                });
+            }
         }
         Ok(())
     }
 
     pub(crate) async fn reset_detected(&mut self) -> Result<bool, Error<T::Error>> {
-        let Status(status) = self.read().await?;
-        if status.contains(Interrupts::RESET) {
+        let status = self.read_bits(Field::of::<Status>()).await?;
+        if status & u32::from(Interrupts::RESET.bits()) != 0 {
             return Ok(true);
         }
-        Ok(self.read_bits::<Mode>().await? == MODE_RESET)
+        Ok(self.read_bits(MODE).await? == MODE_RESET)
     }
 
     pub(crate) async fn energy(&mut self) -> Result<Aenergy, Error<T::Error>> {
-        self.read().await
+        let read = self.read_bits(Field::of::<Aenergy>()).await?;
+        decoded(read)
     }
 
     pub(crate) async fn energy_snapshot(&mut self) -> Result<EnergySnapshot, Error<T::Error>> {
@@ -475,7 +522,8 @@ impl<T: Transport> Core<T> {
                 wait(),
                 Operation::Read(&mut got),
             ];
-            self.transfer(RegisterId::Aenergy, operations).await?;
+            let result = self.transport.transaction(operations).await;
+            result.map_err(|source| self.bus_error(RegisterId::Aenergy, source))?;
             let [first, second, third] = data;
             [high, middle, low] = [[first], [second], [third]];
         } else {
@@ -493,7 +541,8 @@ impl<T: Transport> Core<T> {
                 wait(),
                 Operation::Read(&mut got),
             ];
-            self.transfer(RegisterId::Aenergy, operations).await?;
+            let result = self.transport.transaction(operations).await;
+            result.map_err(|source| self.bus_error(RegisterId::Aenergy, source))?;
         }
         let ([high], [middle], [low], [checksum]) = (high, middle, low, got);
         let raw = u32::from_be_bytes([0, high, middle, low]);
@@ -501,7 +550,8 @@ impl<T: Transport> Core<T> {
     }
 
     pub(crate) async fn waveform(&mut self) -> Result<Waveform, Error<T::Error>> {
-        self.read().await
+        let read = self.read_bits(Field::of::<Waveform>()).await?;
+        decoded(read)
     }
 
     pub(crate) async fn start_temperature(&mut self) -> Result<(), Error<T::Error>> {
@@ -511,30 +561,32 @@ impl<T: Transport> Core<T> {
             start_temperature: true,
             ..self.expected_mode(&config)
         };
-        self.write(mode).await
+        self.write_bits(MODE, mode.encode()).await
     }
 
     pub(crate) async fn temperature(&mut self) -> Result<Option<Temp>, Error<T::Error>> {
-        let mode: Mode = self.read().await?;
+        let mode: Mode = decoded(self.read_bits(MODE).await?)?;
         if mode.start_temperature {
             return Ok(None);
         }
-        self.read().await.map(Some)
+        let read = self.read_bits(Field::of::<Temp>()).await?;
+        decoded(read).map(Some)
     }
 
     pub(crate) async fn take_status(&mut self) -> Result<Interrupts, Error<T::Error>> {
-        let Rststatus(flags) = self.read_and_clear().await?;
-        Ok(flags)
+        let read = self.take_bits(Field::cleared::<Rststatus>()).await?;
+        decoded(read).map(|Rststatus(flags)| flags)
     }
 
     async fn end_offset_test(&mut self, config: &Config) -> Result<(), Error<T::Error>> {
         self.offset_test = false;
-        self.write(config.mode()).await
+        self.write_bits(MODE, config.mode().encode()).await
     }
 
     async fn short_channel_1(&mut self, config: &Config) -> Result<Aenergy, Error<T::Error>> {
-        self.write(self.expected_mode(config)).await?;
-        self.read().await
+        let mode = self.expected_mode(config).encode();
+        self.write_bits(MODE, mode).await?;
+        self.energy().await
     }
 
     pub(crate) async fn start_offset_test(&mut self) -> Result<OffsetTest, Error<T::Error>> {
@@ -559,7 +611,7 @@ impl<T: Transport> Core<T> {
             return Err(Error::OffsetTestAborted);
         }
         let end = match self.check_mode().await {
-            Ok(_) => self.read::<Aenergy>().await,
+            Ok(_) => self.energy().await,
             Err(Error::Reset) => {
                 // Restoring MODE would hide the reset; channel 1 is not shorted any more.
                 self.offset_test = false;
@@ -572,7 +624,7 @@ impl<T: Transport> Core<T> {
     }
 }
 
-fn decoded<R: Register, E>(read: u32) -> Result<R, Error<E>> {
+pub(crate) fn decoded<R: Register, E>(read: u32) -> Result<R, Error<E>> {
     R::decode(read).ok_or(Error::ReservedCode {
         register: R::ID,
         read,

@@ -1,7 +1,7 @@
 //! The two public flavours. Both only hand calls to the same logic.
 
 use crate::config::Config;
-use crate::driver::{Core, EnergySnapshot, OffsetTest, Options, Statistics};
+use crate::driver::{Core, EnergySnapshot, Field, OffsetTest, Options, Statistics, decoded};
 use crate::error::Error;
 use crate::registers::{
     Aenergy, ClearedByRead, Dierev, EnergyDelta, Interrupts, NonDestructive, Temp, Waveform,
@@ -83,12 +83,12 @@ local!(Ade7753Async, Asynchronous);
 macro_rules! methods {
     ($(
         $(#[$doc:meta])*
-        fn $name:ident $([$generic:ident: $bound:path])? ($($argument:ident: $type:ty),*) -> $output:ty;
+        fn $name:ident ($($argument:ident: $type:ty),*) -> $output:ty;
     )*) => {
         impl<SPI: embedded_hal::spi::SpiDevice> Ade7753<SPI> {
             $(
                 $(#[$doc])*
-                pub fn $name $(<$generic: $bound>)? (&mut self $(, $argument: $type)*)
+                pub fn $name(&mut self $(, $argument: $type)*)
                     -> Result<$output, Error<SPI::Error>>
                 {
                     run(self.core.$name($($argument),*))
@@ -100,7 +100,7 @@ macro_rules! methods {
         impl<SPI: embedded_hal_async::spi::SpiDevice> Ade7753Async<SPI> {
             $(
                 $(#[$doc])*
-                pub async fn $name $(<$generic: $bound>)? (&mut self $(, $argument: $type)*)
+                pub async fn $name(&mut self $(, $argument: $type)*)
                     -> Result<$output, Error<SPI::Error>>
                 {
                     self.core.$name($($argument),*).await
@@ -219,26 +219,66 @@ methods! {
     /// [`Error::OffsetTestAborted`]; [`Error::NotConfigured`]; otherwise the error of restoring MODE or, if that
     /// worked, of reading.
     fn finish_offset_test(test: OffsetTest) -> EnergyDelta;
-
-    /// Any register that reading does not change, confirmed by CHKSUM, with retries.
-    ///
-    /// # Errors
-    /// [`Error::Checksum`], [`Error::DeadBus`], [`Error::ReservedCode`], [`Error::Bus`].
-    fn read[R: NonDestructive]() -> R;
-
-    /// Any register that reading clears, checked by CHKSUM, in one attempt.
-    ///
-    /// # Errors
-    /// [`Error::Checksum`] (the content is lost; the bits received are in the error), [`Error::DeadBus`],
-    /// [`Error::Bus`].
-    fn read_and_clear[R: ClearedByRead]() -> R;
-
-    /// Writes a register and reads it back, with retries.
-    ///
-    /// A register of the [`Config`] written to another value is reported by `verify_configuration`.
-    ///
-    /// # Errors
-    /// [`Error::ValueOutOfRange`] (nothing is sent); [`Error::Verify`]; [`Error::Checksum`], [`Error::DeadBus`],
-    /// [`Error::Bus`].
-    fn write[R: Writable](value: R) -> ();
 }
+
+/// The methods for any register, of both flavours: only the bits go through the shared logic.
+macro_rules! any_register {
+    ($name:ident, $bus:path, $wait:ident $(, $async:ident)?) => {
+        impl<SPI: $bus> $name<SPI> {
+            /// Any register that reading does not change, confirmed by CHKSUM, with retries.
+            ///
+            /// # Errors
+            /// [`Error::Checksum`], [`Error::DeadBus`], [`Error::ReservedCode`], [`Error::Bus`].
+            pub $($async)? fn read<R: NonDestructive>(&mut self) -> Result<R, Error<SPI::Error>> {
+                $wait!(self.core.read_bits(Field::of::<R>())).and_then(decoded)
+            }
+
+            /// Any register that reading clears, checked by CHKSUM, in one attempt.
+            ///
+            /// # Errors
+            /// [`Error::Checksum`] (the content is lost; the bits received are in the error), [`Error::DeadBus`],
+            /// [`Error::Bus`].
+            pub $($async)? fn read_and_clear<R: ClearedByRead>(
+                &mut self,
+            ) -> Result<R, Error<SPI::Error>> {
+                $wait!(self.core.take_bits(Field::cleared::<R>())).and_then(decoded)
+            }
+
+            /// Writes a register and reads it back, with retries.
+            ///
+            /// A register of the [`Config`] written to another value is reported by `verify_configuration`.
+            ///
+            /// # Errors
+            /// [`Error::ValueOutOfRange`] (nothing is sent); [`Error::Verify`]; [`Error::Checksum`],
+            /// [`Error::DeadBus`], [`Error::Bus`].
+            pub $($async)? fn write<R: Writable>(
+                &mut self,
+                value: R,
+            ) -> Result<(), Error<SPI::Error>> {
+                $wait!(self.core.write_bits(Field::writable::<R>(), value.encode()))
+            }
+        }
+    };
+}
+
+macro_rules! run_now {
+    ($future:expr) => {
+        run($future)
+    };
+}
+
+#[cfg(feature = "async")]
+macro_rules! wait_for {
+    ($future:expr) => {
+        $future.await
+    };
+}
+
+any_register!(Ade7753, embedded_hal::spi::SpiDevice, run_now);
+#[cfg(feature = "async")]
+any_register!(
+    Ade7753Async,
+    embedded_hal_async::spi::SpiDevice,
+    wait_for,
+    async
+);

@@ -1,0 +1,41 @@
+//! Clocks from the 8 MHz crystal: core and AHB 168 MHz, APB1 42 MHz, APB2 84 MHz.
+//!
+//! Written out for this one tree: the HAL's search for dividers costs 1.5 kB of flash.
+
+use stm32f4xx_hal::pac::{FLASH, RCC};
+
+/// Core and AHB; SysTick counts it.
+pub const CORE_HZ: u32 = 168_000_000;
+
+/// Starts crystal and PLL and changes over to them (RM0090, reset and clock control).
+///
+/// It waits without a bound, for nothing works without a clock: the watchdog, started before, ends the wait.
+pub fn start(rcc: &RCC, flash: &FLASH) {
+    // Five wait states above 150 MHz at 2.7 … 3.6 V (RM0090, table 10), set before the clock rises.
+    flash.acr().write(|w| {
+        w.latency().ws5();
+        w.prften().set_bit();
+        w.icen().set_bit();
+        w.dcen().set_bit()
+    });
+    rcc.cr().modify(|_, w| w.hseon().set_bit());
+    while rcc.cr().read().hserdy().bit_is_clear() {}
+    // 8 MHz / 4 · 168 / 2 = 168 MHz; 336 MHz / 7 = 48 MHz. 2 MHz into the PLL has the least jitter (RM0090, PLLCFGR).
+    // SAFETY: values within the ranges of RM0090: M 2 … 63, N 50 … 432, Q 2 … 15.
+    rcc.pllcfgr().write(|w| unsafe {
+        w.pllm().bits(4);
+        w.plln().bits(168);
+        w.pllp().div2();
+        w.pllq().bits(7);
+        w.pllsrc().hse()
+    });
+    rcc.cr().modify(|_, w| w.pllon().set_bit());
+    while rcc.cr().read().pllrdy().bit_is_clear() {}
+    rcc.cfgr().write(|w| {
+        w.hpre().div1();
+        w.ppre1().div4();
+        w.ppre2().div2();
+        w.sw().pll()
+    });
+    while !rcc.cfgr().read().sws().is_pll() {}
+}
