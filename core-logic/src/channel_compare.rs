@@ -534,6 +534,8 @@ mod tests {
         compare: ChannelCompare,
         config: CompareConfig,
         now: u64,
+        /// Length of a conversion in µs.
+        period: u64,
         next_conversion: u64,
         next_meter: u64,
         /// nC of the meter.
@@ -550,6 +552,7 @@ mod tests {
                 compare: ChannelCompare::new(),
                 config: CompareConfig::default(),
                 now: 0,
+                period: PERIOD,
                 next_conversion: PERIOD,
                 next_meter: POLL,
                 charge: 0,
@@ -599,14 +602,14 @@ mod tests {
                 self.now = next;
                 if self.now == self.next_conversion {
                     let conversion = Conversion {
-                        started: at(self.now - PERIOD + 300),
+                        started: at(self.now - self.period + 300),
                         finished: at(self.now),
                         current: Microamps::from_milliamps(converter_ma),
                         range: self.range,
                         usable: self.usable,
                     };
                     let _ = self.compare.on_conversion(&self.config, &conversion);
-                    self.next_conversion += PERIOD;
+                    self.next_conversion += self.period;
                 }
                 if self.now == self.next_meter {
                     let report = self.report();
@@ -713,6 +716,17 @@ mod tests {
                 "{report:?}"
             );
         }
+    }
+
+    /// A conversion may begin up to its length before the last count, twice that is no evidence: 250 ms at 8 SPS.
+    #[test]
+    fn a_slow_conversion_under_way_at_the_last_count_is_no_frozen_meter() {
+        let mut bench = Bench::new();
+        bench.period = 125_000;
+        bench.next_conversion = 125_000;
+        let _ = bench.run(2_500, 50_000, 50_000);
+        let found = bench.run_until(3_000, 0, 50_000, |report| report.frozen);
+        assert!((250..=500).contains(&found.unwrap()), "{found:?} ms");
     }
 
     #[test]
