@@ -147,7 +147,7 @@ fn drive(recording: &str, scale: &str, out: &Path) -> Result<String, Box<dyn Err
             }
             Step::Event(_) => {}
             Step::Tick(tick) => {
-                let at_us = board.now_us / 10_000 * 10_000;
+                let at_us = board.now_us;
                 seen = seen.union(tick.changes.set);
                 if first_valid_ms.is_none() && board.measurement.current().validity.is_valid() {
                     first_valid_ms = Some(at_us / 1_000);
@@ -170,14 +170,19 @@ fn drive(recording: &str, scale: &str, out: &Path) -> Result<String, Box<dyn Err
                     } else {
                         String::new()
                     };
+                    let soc = board.measurement.state_of_charge();
+                    let share = if soc.validity.is_valid() {
+                        format!("{:.4}", f64::from(soc.state_of_charge.get()) * 1e-4)
+                    } else {
+                        String::new()
+                    };
                     writeln!(
                         table,
-                        "{seconds:.3},{:.6},{measured},{:.4},{:.4},{},{:.4}",
+                        "{seconds:.3},{:.6},{measured},{:.4},{:.4},{},{share}",
                         board.world.current_a(),
                         board.world.charge_c,
                         board.meter.report().charge_total.get() as f64 * 1e-9,
                         u8::from(board.world.flag_high()),
-                        f64::from(board.measurement.state_of_charge().state_of_charge.get()) * 1e-4,
                     )?;
                 }
             }

@@ -388,14 +388,7 @@ impl BoardState {
     #[must_use]
     pub fn encode(&self) -> Frame {
         use layout::board_state as at;
-        let phase = self.key_calibration.map(|phase| match phase {
-            KeyPhase::Off => 0,
-            KeyPhase::Taking => 1,
-            KeyPhase::Taken => 2,
-            KeyPhase::Failed(_) => 3,
-            KeyPhase::Resumed => 4,
-            KeyPhase::Disabled => 5,
-        });
+        let phase = self.key_calibration.map(|phase| i64::from(phase.number()));
         Word::default()
             .with_optional(at::KEY, self.key.map(key_number))
             .with_optional(at::HIGH_VOLTAGE, self.high_voltage.map(i64::from))

@@ -178,8 +178,6 @@ pub const METER_COUNTS_PER_SECOND_Q32: u64 = {
 /// No-load threshold: products below 0.001 % of the full-scale output are not counted (ADE7753 Rev C, features;
 /// figure *assumed*). With channel 2 at a fifth of its scale that is 0.005 % of channel 1's: 3 mA of 60 A.
 pub const METER_NO_LOAD: Ppm = Ppm(50);
-/// The same as a bare number.
-pub const METER_NO_LOAD_PPM_OF_CHANNEL_1: i64 = METER_NO_LOAD.get() as i64;
 
 // ---------------------------------------------------------------------------------------------- supply and key state: D4
 

@@ -208,6 +208,21 @@ pub enum KeyPhase {
     Disabled,
 }
 
+impl KeyPhase {
+    /// Its number on CAN and Modbus.
+    #[must_use]
+    pub const fn number(self) -> u8 {
+        match self {
+            Self::Off => 0,
+            Self::Taking => 1,
+            Self::Taken => 2,
+            Self::Failed(_) => 3,
+            Self::Resumed => 4,
+            Self::Disabled => 5,
+        }
+    }
+}
+
 /// What a step results in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]

@@ -198,7 +198,7 @@ pub struct Tick {
     pub found: Option<Found>,
 }
 
-/// How many ticks the supply is averaged over: one conversion of ADC1 is 1.6 mV of a 5 V supply.
+/// The supply is averaged over 2⁴ readings: one conversion of ADC1 is 1.6 mV of a 5 V supply.
 const SUPPLY_SHIFT: u32 = 4;
 /// Environment readings older than this are missing.
 const ENVIRONMENT_TIMEOUT: Duration = Duration::from_ticks(500_000);
@@ -1230,7 +1230,7 @@ impl Measurement {
         readings.activity_progress = percent(taken, of);
         (readings.command_state, readings.command_reason) = self.order_outcome;
         readings.supply_points = [points.0, points.1];
-        readings.key_calibration_state = key_phase_number(self.key_outputs.phase);
+        readings.key_calibration_state = u16::from(self.key_outputs.phase.number());
         readings.current = self.reading.current;
         readings.current_average = average;
         readings.meter_current = self.meter.mean_current;
@@ -1301,16 +1301,4 @@ fn hall_voltage(network: Microvolts) -> Microvolts {
 fn percent(taken: u16, of: u16) -> u16 {
     let share = u32::from(taken) * 100 / u32::from(of.max(1));
     u16::try_from(share.min(100)).unwrap_or(100)
-}
-
-/// The number of a phase on Modbus, as on CAN.
-const fn key_phase_number(phase: KeyPhase) -> u16 {
-    match phase {
-        KeyPhase::Off => 0,
-        KeyPhase::Taking => 1,
-        KeyPhase::Taken => 2,
-        KeyPhase::Failed(_) => 3,
-        KeyPhase::Resumed => 4,
-        KeyPhase::Disabled => 5,
-    }
 }

@@ -17,8 +17,6 @@ use core_logic::validity::Validity;
 
 use crate::ideal_board::{Event, IdealBoard, Row, Timing};
 
-const TICK_US: u64 = 10_000;
-
 /// The board with its measuring logic.
 pub struct HostBoard<'a> {
     pub world: IdealBoard<'a>,
@@ -41,7 +39,6 @@ pub struct HostBoard<'a> {
     pub first_reading_c: Option<f64>,
     pub last_reading_c: f64,
     sender: can::Sender,
-    next_tick_us: u64,
     pub now_us: u64,
 }
 
@@ -80,22 +77,18 @@ impl<'a> HostBoard<'a> {
             first_reading_c: None,
             last_reading_c: 0.0,
             sender: can::Sender::default(),
-            next_tick_us: 0,
             now_us: 0,
         }
     }
 
-    /// The next event of the hardware or the next tick, whichever comes first; `None` at the profile's end.
-    ///
-    /// A tick is late by at most the time to the hardware's next event: the profile is read forward only.
+    /// The next event of the hardware or the next tick; `None` at the profile's end.
     pub fn step(&mut self) -> Option<Step> {
-        if self.now_us >= self.next_tick_us {
-            let at = self.next_tick_us;
-            self.next_tick_us += TICK_US;
-            return Some(Step::Tick(self.tick(at)));
-        }
         let event = self.world.next_event()?;
         match event {
+            Event::Tick { at_us } => {
+                self.now_us = at_us;
+                return Some(Step::Tick(self.tick(at_us)));
+            }
             Event::Edge { at_us, flag_high } => {
                 self.now_us = at_us;
                 self.edges.on_edge(Instant::from_ticks(at_us), flag_high);

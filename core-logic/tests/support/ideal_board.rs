@@ -35,6 +35,8 @@ pub enum Event {
     Edge { at_us: u64, flag_high: bool },
     /// AENERGY was read, 24 bit, sign extended.
     Energy { at_us: u64, counts: i32 },
+    /// The firmware's clock: a tick.
+    Tick { at_us: u64 },
     /// A conversion that began at `started_us` was read.
     Conversion {
         started_us: u64,
@@ -46,6 +48,7 @@ pub enum Event {
 /// When the hardware is read, and how.
 #[derive(Clone, Copy, Debug)]
 pub struct Timing {
+    pub tick_s: f64,
     pub meter_poll_s: f64,
     pub snapshot_latency_s: f64,
     pub conversion_s: f64,
@@ -56,6 +59,7 @@ pub struct Timing {
 impl Default for Timing {
     fn default() -> Self {
         Self {
+            tick_s: design::CURRENT_FRAME_MS as f64 * 1e-3,
             meter_poll_s: design::METER_POLL_MS as f64 * 1e-3,
             snapshot_latency_s: 60e-6,
             conversion_s: 1.0 / 32.0,
@@ -74,6 +78,7 @@ pub struct IdealBoard<'a> {
     energy: f64,
     conversion_started: f64,
     conversion_integral: f64,
+    next_tick: f64,
     next_poll: f64,
     snapshot_at: f64,
     /// ∫ i dt since the start.
@@ -94,6 +99,7 @@ impl<'a> IdealBoard<'a> {
             energy: 0.0,
             conversion_started: t,
             conversion_integral: 0.0,
+            next_tick: t,
             next_poll: t + timing.meter_poll_s,
             snapshot_at: f64::INFINITY,
             charge_c: 0.0,
@@ -217,6 +223,7 @@ impl<'a> IdealBoard<'a> {
             let conversion_end = self.conversion_started + self.timing.conversion_s;
             let stop = row_end
                 .min(conversion_end)
+                .min(self.next_tick)
                 .min(self.next_poll)
                 .min(self.snapshot_at);
             let edge = if self.flag_high {
@@ -235,6 +242,10 @@ impl<'a> IdealBoard<'a> {
                 });
             }
             self.advance(stop);
+            if stop == self.next_tick {
+                self.next_tick += self.timing.tick_s;
+                return Some(Event::Tick { at_us: self.us() });
+            }
             if stop == self.snapshot_at || stop == self.next_poll {
                 if stop == self.next_poll {
                     self.next_poll += self.timing.meter_poll_s;
