@@ -1,0 +1,579 @@
+//! AHB and APB: which peripheral an address belongs to, and what of one peripheral another one sees.
+
+use std::fmt;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use rsemu::core::error::BusError;
+use rsemu::core::space::{MemAttrs, MemOps, MemResult};
+
+use crate::board::Board;
+use crate::can_bus::CanBus;
+use crate::mcu::adc::Adc1;
+use crate::mcu::exti::Exti;
+use crate::mcu::flash_interface::FlashInterface;
+use crate::mcu::gpio::GpioPorts;
+use crate::mcu::i2c::I2c;
+use crate::mcu::iwdg::Iwdg;
+use crate::mcu::rcc::{PeripheralId, Rcc, ResetCause};
+use crate::mcu::spi::Spi;
+use crate::mcu::syscfg::Syscfg;
+use crate::mcu::tim2::Tim2;
+use crate::mcu::usart::Usart;
+use crate::mcu::{Clocks, Context, Interrupts, Peripheral, Unmodelled};
+use crate::outside::{Outputs, Outside, PORTS, SpiBus};
+use crate::rs485_line::LineConfig;
+use crate::time::Ticks;
+
+/// Base of the peripherals' address range.
+const BASE: u32 = 0x4000_0000;
+/// Bit rate of the vehicle's bus.
+const CAN_BIT_RATE: u32 = 500_000;
+
+/// An access that ends the run.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Failure {
+    /// What was touched.
+    pub access: Unmodelled,
+}
+
+/// The bus matrix with everything behind it.
+pub struct SystemBus {
+    /// Locked for each access: the core's trait wants `&self`.
+    state: Mutex<State>,
+    now: AtomicU64,
+    next: AtomicU64,
+    ticks_per_cycle: AtomicU64,
+    touched: AtomicBool,
+}
+
+impl fmt::Debug for SystemBus {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("SystemBus")
+    }
+}
+
+struct State {
+    rcc: Rcc,
+    flash: FlashInterface,
+    gpio: GpioPorts,
+    exti: Exti,
+    syscfg: Syscfg,
+    tim2: Tim2,
+    iwdg: Iwdg,
+    adc1: Adc1,
+    spi1: Spi,
+    spi2: Spi,
+    i2c1: I2c,
+    usart2: Usart,
+    can: CanBus,
+    clocks: Clocks,
+    interrupts: Interrupts,
+    levels: [u16; PORTS],
+    outputs: Outputs,
+    reset: Option<ResetCause>,
+    failure: Option<Failure>,
+    poll: Poll,
+    board: Board,
+}
+
+/// The counter that bounded waits look at between two looks at a flag: TIM2_CNT.
+const TIME_COUNTER: u32 = 0x4000_0024;
+/// So many equal turns make a polling loop.
+const EQUAL_TURNS: u8 = 3;
+
+/// A loop that reads the same register again and again, and finds the same value.
+#[derive(Clone, Copy, Debug, Default)]
+struct Poll {
+    address: u32,
+    value: u32,
+    at: u64,
+    period: u64,
+    turns: u8,
+}
+
+impl Poll {
+    /// A register was read. Whether the loop has turned often enough to be one.
+    fn on_read(&mut self, address: u32, value: u32, now: Ticks) -> bool {
+        if address == TIME_COUNTER {
+            return false;
+        }
+        if address != self.address || value != self.value {
+            *self = Self {
+                address,
+                value,
+                at: now.0,
+                period: 0,
+                turns: 0,
+            };
+            return false;
+        }
+        let period = now.0 - self.at;
+        self.turns = if period == self.period {
+            self.turns.saturating_add(1)
+        } else {
+            0
+        };
+        self.period = period;
+        self.at = now.0;
+        self.turns >= EQUAL_TURNS
+    }
+}
+
+/// A block of registers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Block {
+    Rcc,
+    Flash,
+    Gpio,
+    Exti,
+    Syscfg,
+    Tim2,
+    Iwdg,
+    Adc1,
+    Spi1,
+    Spi2,
+    I2c1,
+    Usart2,
+    Can1,
+}
+
+impl Block {
+    /// The block at an address, the block's base, and the clock it needs (RM0090, register boundary addresses).
+    const fn at(address: u32) -> Option<(Self, u32, Option<PeripheralId>)> {
+        Some(match address {
+            0x4000_0000..=0x4000_03FF => (Self::Tim2, 0x4000_0000, Some(PeripheralId::Tim2)),
+            0x4000_3000..=0x4000_33FF => (Self::Iwdg, 0x4000_3000, None),
+            0x4000_3800..=0x4000_3BFF => (Self::Spi2, 0x4000_3800, Some(PeripheralId::Spi2)),
+            0x4000_4400..=0x4000_47FF => (Self::Usart2, 0x4000_4400, Some(PeripheralId::Usart2)),
+            0x4000_5400..=0x4000_57FF => (Self::I2c1, 0x4000_5400, Some(PeripheralId::I2c1)),
+            0x4000_6400..=0x4000_67FF => (Self::Can1, 0x4000_6400, Some(PeripheralId::Can1)),
+            0x4001_2000..=0x4001_23FF => (Self::Adc1, 0x4001_2000, Some(PeripheralId::Adc1)),
+            0x4001_3000..=0x4001_33FF => (Self::Spi1, 0x4001_3000, Some(PeripheralId::Spi1)),
+            0x4001_3800..=0x4001_3BFF => (Self::Syscfg, 0x4001_3800, Some(PeripheralId::Syscfg)),
+            // EXTI's registers are always reachable.
+            0x4001_3C00..=0x4001_3FFF => (Self::Exti, 0x4001_3C00, None),
+            0x4002_0000..=0x4002_03FF => (Self::Gpio, 0x4002_0000, Some(PeripheralId::GpioA)),
+            0x4002_0400..=0x4002_07FF => (Self::Gpio, 0x4002_0000, Some(PeripheralId::GpioB)),
+            0x4002_0800..=0x4002_0BFF => (Self::Gpio, 0x4002_0000, Some(PeripheralId::GpioC)),
+            0x4002_3800..=0x4002_3BFF => (Self::Rcc, 0x4002_3800, None),
+            0x4002_3C00..=0x4002_3FFF => (Self::Flash, 0x4002_3C00, None),
+            _ => return None,
+        })
+    }
+}
+
+/// Calls `$peripheral.$method(.., context)` with a context made of the rest of the state.
+macro_rules! call {
+    ($state:expr, $now:expr, $peripheral:ident . $method:ident ( $($argument:expr),* )) => {{
+        let state = &mut *$state;
+        let mut context = Context {
+            now: $now,
+            clocks: state.clocks,
+            interrupts: &state.interrupts,
+            outside: &mut state.board,
+        };
+        state.$peripheral.$method($($argument,)* &mut context)
+    }};
+}
+
+/// The same for every peripheral that can have events of its own.
+macro_rules! each_active {
+    ($macro:ident) => {
+        $macro!(rcc, tim2, iwdg, adc1, spi1, spi2, i2c1, usart2, can)
+    };
+}
+
+impl State {
+    fn read(&mut self, address: u32, bytes: u8, now: Ticks) -> Result<u32, Unmodelled> {
+        let (block, offset) = self.reach(address)?;
+        match block {
+            Block::Rcc => call!(self, now, rcc.read(offset, bytes)),
+            Block::Flash => call!(self, now, flash.read(offset, bytes)),
+            Block::Gpio => call!(self, now, gpio.read(offset, bytes)),
+            Block::Exti => call!(self, now, exti.read(offset, bytes)),
+            Block::Syscfg => call!(self, now, syscfg.read(offset, bytes)),
+            Block::Tim2 => call!(self, now, tim2.read(offset, bytes)),
+            Block::Iwdg => call!(self, now, iwdg.read(offset, bytes)),
+            Block::Adc1 => call!(self, now, adc1.read(offset, bytes)),
+            Block::Spi1 => call!(self, now, spi1.read(offset, bytes)),
+            Block::Spi2 => call!(self, now, spi2.read(offset, bytes)),
+            Block::I2c1 => call!(self, now, i2c1.read(offset, bytes)),
+            Block::Usart2 => call!(self, now, usart2.read(offset, bytes)),
+            Block::Can1 => call!(self, now, can.read(offset, bytes)),
+        }
+    }
+
+    fn write(&mut self, address: u32, bytes: u8, value: u32, now: Ticks) -> Result<(), Unmodelled> {
+        let (block, offset) = self.reach(address)?;
+        match block {
+            Block::Rcc => call!(self, now, rcc.write(offset, bytes, value)),
+            Block::Flash => call!(self, now, flash.write(offset, bytes, value)),
+            Block::Gpio => {
+                call!(self, now, gpio.write(offset, bytes, value))?;
+                self.follow_outputs(now);
+                Ok(())
+            }
+            Block::Exti => call!(self, now, exti.write(offset, bytes, value)),
+            Block::Syscfg => call!(self, now, syscfg.write(offset, bytes, value)),
+            Block::Tim2 => call!(self, now, tim2.write(offset, bytes, value)),
+            Block::Iwdg => call!(self, now, iwdg.write(offset, bytes, value)),
+            Block::Adc1 => call!(self, now, adc1.write(offset, bytes, value)),
+            Block::Spi1 => call!(self, now, spi1.write(offset, bytes, value)),
+            Block::Spi2 => call!(self, now, spi2.write(offset, bytes, value)),
+            Block::I2c1 => call!(self, now, i2c1.write(offset, bytes, value)),
+            Block::Usart2 => call!(self, now, usart2.write(offset, bytes, value)),
+            Block::Can1 => call!(self, now, can.write(offset, bytes, value)),
+        }?;
+        if block == Block::Rcc {
+            self.follow_rcc(now)?;
+        }
+        Ok(())
+    }
+
+    /// The block at `address`, whose clock has to be on, and the offset in it.
+    fn reach(&self, address: u32) -> Result<(Block, u32), Unmodelled> {
+        let Some((block, base, clock)) = Block::at(address) else {
+            return Err(Unmodelled {
+                register: format!("{address:#010X}"),
+                what: "a peripheral that this board does not use".to_owned(),
+            });
+        };
+        if let Some(clock) = clock.filter(|clock| !self.rcc.is_enabled(*clock)) {
+            return Err(Unmodelled {
+                register: format!("{block:?} at {address:#010X}"),
+                what: format!("an access while RCC keeps the clock of {clock:?} off"),
+            });
+        }
+        Ok((block, address - base))
+    }
+
+    /// Clocks and reset bits have an effect elsewhere.
+    fn follow_rcc(&mut self, now: Ticks) -> Result<(), Unmodelled> {
+        let clocks = self.rcc.clocks();
+        if clocks != self.clocks {
+            self.clocks = clocks;
+            self.flash.check(clocks)?;
+            // It counts up to now with the old clock.
+            call!(self, now, tim2.advance());
+        }
+        for peripheral in self.rcc.take_resets() {
+            match peripheral {
+                PeripheralId::GpioA => self.gpio.reset_port(0),
+                PeripheralId::GpioB => self.gpio.reset_port(1),
+                PeripheralId::GpioC => self.gpio.reset_port(2),
+                PeripheralId::Tim2 => call!(self, now, tim2.reset()),
+                PeripheralId::Spi1 => call!(self, now, spi1.reset()),
+                PeripheralId::Spi2 => call!(self, now, spi2.reset()),
+                PeripheralId::Usart2 => call!(self, now, usart2.reset()),
+                PeripheralId::I2c1 => call!(self, now, i2c1.reset()),
+                PeripheralId::Can1 => call!(self, now, can.reset()),
+                PeripheralId::Adc1 => call!(self, now, adc1.reset()),
+                PeripheralId::Syscfg => call!(self, now, syscfg.reset()),
+                PeripheralId::Pwr => {}
+            }
+        }
+        self.follow_outputs(now);
+        Ok(())
+    }
+
+    fn follow_outputs(&mut self, now: Ticks) {
+        let outputs = self.gpio.outputs();
+        if outputs != self.outputs {
+            self.outputs = outputs;
+            self.board.outputs_changed(&outputs, now);
+        }
+        self.follow_levels(now);
+    }
+
+    /// Pins that changed reach EXTI.
+    fn follow_levels(&mut self, now: Ticks) {
+        let driven = self.board.levels(now);
+        let levels = self.gpio.input_levels(&driven);
+        if levels != self.levels {
+            self.exti
+                .on_levels(self.levels, levels, &self.syscfg, &self.interrupts);
+            self.levels = levels;
+        }
+    }
+
+    fn next_event(&self) -> Ticks {
+        let mut next = self.board.next_event();
+        macro_rules! earliest {
+            ($($peripheral:ident),*) => {
+                $(if let Some(at) = self.$peripheral.next_event() {
+                    next = next.min(at);
+                })*
+            };
+        }
+        each_active!(earliest);
+        next
+    }
+
+    /// Everything that is due at `now`.
+    fn advance(&mut self, now: Ticks) -> Result<(), Unmodelled> {
+        if self.board.next_event() <= now {
+            self.board.advance(now);
+            for frame in self.board.take_vehicle_frames(now) {
+                self.can.inject(frame, now);
+            }
+            for (at, character) in self.board.line.take_due(now) {
+                call!(self, now, usart2.receive(character, at));
+                let follows = self.board.line.next_start(at);
+                if follows.is_some_and(|start| start < at + self.board.line.character()) {
+                    self.usart2.start_bit();
+                }
+            }
+        }
+        macro_rules! due {
+            ($($peripheral:ident),*) => {
+                $(if self.$peripheral.next_event().is_some_and(|at| at <= now) {
+                    call!(self, now, $peripheral.advance());
+                })*
+            };
+        }
+        each_active!(due);
+        self.follow_rcc(now)?;
+        if self.iwdg.take_reset() {
+            self.reset = Some(ResetCause::IndependentWatchdog);
+        }
+        Ok(())
+    }
+
+    /// A system reset: every peripheral but the reset flags in RCC.
+    fn reset(&mut self, cause: ResetCause, now: Ticks) {
+        macro_rules! all {
+            ($($peripheral:ident),*) => {
+                $(call!(self, now, $peripheral.reset());)*
+            };
+        }
+        all!(
+            rcc, flash, gpio, exti, syscfg, tim2, iwdg, adc1, spi1, spi2, i2c1, usart2, can
+        );
+        self.rcc.set_reset_cause(cause);
+        self.clocks = self.rcc.clocks();
+        self.reset = None;
+        self.follow_outputs(now);
+    }
+}
+
+impl SystemBus {
+    /// Everything off, with the board around it.
+    pub fn new(board: Board) -> Self {
+        let rcc = Rcc::default();
+        let clocks = rcc.clocks();
+        let state = State {
+            rcc,
+            flash: FlashInterface::new(),
+            gpio: GpioPorts::new(),
+            exti: Exti::new(),
+            syscfg: Syscfg::new(),
+            tim2: Tim2::new(),
+            iwdg: Iwdg::default(),
+            adc1: Adc1::default(),
+            spi1: Spi::new(SpiBus::Meter),
+            spi2: Spi::new(SpiBus::Flash),
+            i2c1: I2c::new(),
+            usart2: Usart::new(LineConfig::default().baud),
+            can: CanBus::new(CAN_BIT_RATE),
+            clocks,
+            interrupts: Interrupts::default(),
+            levels: [0; PORTS],
+            outputs: Outputs::default(),
+            reset: None,
+            failure: None,
+            poll: Poll::default(),
+            board,
+        };
+        let bus = Self {
+            state: Mutex::new(state),
+            now: AtomicU64::new(0),
+            next: AtomicU64::new(0),
+            ticks_per_cycle: AtomicU64::new(1),
+            touched: AtomicBool::new(false),
+        };
+        let state = bus.lock();
+        bus.publish(&state);
+        drop(state);
+        bus
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        // One thread: nobody can have left it poisoned and gone on.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What the run loop needs without the lock.
+    fn publish(&self, state: &State) {
+        self.next.store(state.next_event().0, Ordering::Relaxed);
+        let per_cycle = Ticks::PER_SECOND / u64::from(state.clocks.ahb.max(1));
+        self.ticks_per_cycle
+            .store(per_cycle.max(1), Ordering::Relaxed);
+    }
+
+    /// The next time at which something happens by itself.
+    pub fn next_event(&self) -> Ticks {
+        Ticks(self.next.load(Ordering::Relaxed))
+    }
+
+    /// Units of time per cycle of the core.
+    pub fn ticks_per_cycle(&self) -> u64 {
+        self.ticks_per_cycle.load(Ordering::Relaxed)
+    }
+
+    /// The time at which the core's next access happens.
+    pub fn set_now(&self, now: Ticks) {
+        self.now.store(now.0, Ordering::Relaxed);
+    }
+
+    /// Whether an access may have changed the next event, a clock or an interrupt since the last call.
+    pub fn take_touched(&self) -> bool {
+        self.touched.load(Ordering::Relaxed) && self.touched.swap(false, Ordering::Relaxed)
+    }
+
+    /// Everything that is due at `now`.
+    pub fn advance(&self, now: Ticks) {
+        self.set_now(now);
+        let mut state = self.lock();
+        if let Err(access) = state.advance(now) {
+            state.failure.get_or_insert(Failure { access });
+        }
+        self.publish(&state);
+    }
+
+    /// The period of a polling loop that the core is in. The loop has just read its register; the caller may let whole
+    /// turns of it pass at once, and says how long that was.
+    pub fn skip_polling(&self, skip: impl FnOnce(Ticks) -> Ticks) {
+        let mut state = self.lock();
+        if state.poll.turns >= EQUAL_TURNS && state.poll.period > 0 {
+            state.poll.at += skip(Ticks(state.poll.period)).0;
+        }
+    }
+
+    /// Interrupt levels, if one changed since the last call.
+    pub fn take_interrupts(&self) -> Option<[u32; 3]> {
+        self.lock().interrupts.take_changed()
+    }
+
+    /// The access that ends the run, if there was one.
+    pub fn take_failure(&self) -> Option<Failure> {
+        self.lock().failure.take()
+    }
+
+    /// A reset that a peripheral asked for.
+    pub fn take_reset(&self) -> Option<ResetCause> {
+        self.lock().reset.take()
+    }
+
+    /// A system reset.
+    pub fn reset(&self, cause: ResetCause, now: Ticks) {
+        let mut state = self.lock();
+        state.reset(cause, now);
+        self.publish(&state);
+    }
+
+    /// Works on the board at `now`.
+    pub fn with_board<T>(&self, now: Ticks, work: impl FnOnce(&mut Board) -> T) -> T {
+        let mut state = self.lock();
+        let result = work(&mut state.board);
+        state.follow_levels(now);
+        self.publish(&state);
+        result
+    }
+
+    /// Works on the CAN bus.
+    pub fn with_can<T>(&self, work: impl FnOnce(&mut CanBus) -> T) -> T {
+        let mut state = self.lock();
+        let result = work(&mut state.can);
+        self.publish(&state);
+        result
+    }
+
+    /// Works on ADC1, for the faults that sit in its supply.
+    pub fn with_adc<T>(&self, work: impl FnOnce(&mut Adc1) -> T) -> T {
+        work(&mut self.lock().adc1)
+    }
+
+    /// Pins on which the MCU and the outside have driven against each other since the last call, as bits of each port.
+    pub fn take_conflicts(&self) -> [u16; PORTS] {
+        self.lock().gpio.take_conflicts()
+    }
+
+    /// Works on clocks and watchdog, for the faults that sit in the MCU's surroundings (crystal, LSI).
+    pub fn with_clocks<T>(&self, work: impl FnOnce(&mut Rcc, &mut Iwdg) -> T) -> T {
+        let mut state = self.lock();
+        let State { rcc, iwdg, .. } = &mut *state;
+        let result = work(rcc, iwdg);
+        self.publish(&state);
+        result
+    }
+
+    fn failed(&self, state: &mut State, access: Unmodelled) -> BusError {
+        state.failure.get_or_insert(Failure { access });
+        self.touched.store(true, Ordering::Relaxed);
+        BusError::BadAccess
+    }
+}
+
+impl MemOps for SystemBus {
+    fn read(&self, offset: u64, dst: &mut [u8], attrs: MemAttrs) -> MemResult {
+        let (Some(address), Ok(bytes)) = (address(offset), u8::try_from(dst.len())) else {
+            return Err(BusError::BadAccess);
+        };
+        // A debugger's look must not clear flags; nothing here debugs, so it is refused.
+        if attrs.debug {
+            return Err(BusError::BadAccess);
+        }
+        let now = Ticks(self.now.load(Ordering::Relaxed));
+        let mut state = self.lock();
+        match state.read(address, bytes, now) {
+            Ok(value) => {
+                for (to, from) in dst.iter_mut().zip(value.to_le_bytes()) {
+                    *to = from;
+                }
+                if state.poll.on_read(address, value, now) {
+                    self.touched.store(true, Ordering::Relaxed);
+                }
+                // Reading can clear a flag or take a byte.
+                if state.interrupts.is_changed() {
+                    self.touched.store(true, Ordering::Relaxed);
+                }
+                let next = state.next_event().0;
+                if next != self.next.load(Ordering::Relaxed) {
+                    self.next.store(next, Ordering::Relaxed);
+                    self.touched.store(true, Ordering::Relaxed);
+                }
+                Ok(())
+            }
+            Err(access) => Err(self.failed(&mut state, access)),
+        }
+    }
+
+    fn write(&self, offset: u64, src: &[u8], _attrs: MemAttrs) -> MemResult {
+        let (Some(address), Ok(bytes)) = (address(offset), u8::try_from(src.len())) else {
+            return Err(BusError::BadAccess);
+        };
+        let mut word = [0; 4];
+        for (to, from) in word.iter_mut().zip(src) {
+            *to = *from;
+        }
+        let now = Ticks(self.now.load(Ordering::Relaxed));
+        let mut state = self.lock();
+        state.poll = Poll::default();
+        let result = state.write(address, bytes, u32::from_le_bytes(word), now);
+        self.touched.store(true, Ordering::Relaxed);
+        match result {
+            Ok(()) => {
+                self.publish(&state);
+                Ok(())
+            }
+            Err(access) => Err(self.failed(&mut state, access)),
+        }
+    }
+}
+
+fn address(offset: u64) -> Option<u32> {
+    u32::try_from(offset)
+        .ok()
+        .and_then(|offset| BASE.checked_add(offset))
+}

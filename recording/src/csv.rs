@@ -1,0 +1,437 @@
+//! The canonical CSV: UTF-8, one header line, comma, decimal point, a row per line, an empty field for a missing value.
+//!
+//! Lines are split here and not by a general CSV reader, because every message must name the line it is about.
+
+use std::{
+    borrow::Cow,
+    fs,
+    io::Write,
+    path::{Path, PathBuf},
+};
+
+use crate::{
+    error::{Error, Kind, Place, Result, quoted},
+    mapping::Mapping,
+    output::{Columns, WholeFile},
+    series::Recording,
+    table::Table,
+};
+
+/// Reads a recording.
+pub fn read(path: &Path) -> Result<Recording> {
+    read_mapped(path, &Mapping::new())
+}
+
+/// Reads a recording whose columns have other names.
+pub fn read_mapped(path: &Path, mapping: &Mapping) -> Result<Recording> {
+    read_table(path)?.mapped(mapping)?.into_recording()
+}
+
+/// Reads a table that need not have time.
+pub fn read_table(path: &Path) -> Result<Table> {
+    let bytes = fs::read(path).map_err(|error| Error::reading(path, &error))?;
+    parse(&path.display().to_string(), &bytes)
+}
+
+/// Reads a table from memory; `source` is what messages call it.
+pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
+    let fault =
+        |kind, place, found: String, expected| Error::new(kind, source, place, found, expected);
+    let text = text(source, bytes)?;
+    let mut lines = Lines::new(text);
+    let Some((header_line, header)) = lines.next() else {
+        return Err(fault(
+            Kind::Empty,
+            Place::default(),
+            "an empty file".into(),
+            "a header line",
+        ));
+    };
+    let names = names(source, header_line, header)?;
+
+    // Lines are of about the same length.
+    let expected_rows = text.len() / (header.len().max(names.len() * 4) + 1);
+    let mut columns = vec![Vec::with_capacity(expected_rows); names.len()];
+    let mut line_numbers = Vec::with_capacity(expected_rows);
+    for (number, line) in lines {
+        let mut fields = Fields::new(line);
+        for (column, (name, values)) in names.iter().zip(&mut columns).enumerate() {
+            let place = || Place::field(number, column, name);
+            let field = fields.next().ok_or_else(|| {
+                fault(
+                    Kind::FieldCount,
+                    Place::line(number),
+                    format!("{column} fields"),
+                    "one for each column of the header",
+                )
+            })?;
+            let field = field.ok_or_else(|| unclosed(source, place()))?;
+            values.push(value(&field).map_err(|kind| {
+                fault(kind, place(), quoted(&field), "a number or an empty field")
+            })?);
+        }
+        let more = fields.count();
+        if more > 0 {
+            return Err(fault(
+                Kind::FieldCount,
+                Place::line(number),
+                format!("{} fields", names.len() + more),
+                "one for each column of the header",
+            ));
+        }
+        line_numbers.push(number);
+    }
+    Table::with_lines(
+        source,
+        names.into_iter().zip(columns).collect(),
+        line_numbers,
+    )
+}
+
+/// The bytes as text, without a byte order mark.
+fn text<'a>(source: &str, bytes: &'a [u8]) -> Result<&'a str> {
+    let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
+    std::str::from_utf8(bytes).map_err(|error| {
+        let good = &bytes[..error.valid_up_to()];
+        let line = memchr::memchr_iter(b'\n', good).count() as u64 + 1;
+        let start = memchr::memrchr(b'\n', good).map_or(0, |end| end + 1);
+        Error::new(
+            Kind::NotUtf8,
+            source,
+            Place::line(line),
+            format!(
+                "the byte {:#04x} after {} characters",
+                bytes[error.valid_up_to()],
+                String::from_utf8_lossy(&good[start..]).chars().count()
+            ),
+            "UTF-8 text",
+        )
+    })
+}
+
+fn names(source: &str, line: u64, header: &str) -> Result<Vec<String>> {
+    let mut names: Vec<String> = Vec::new();
+    for (column, field) in Fields::new(header).enumerate() {
+        let place = Place {
+            line: Some(line),
+            column: Some(column + 1),
+            ..Place::default()
+        };
+        let Some(field) = field else {
+            return Err(unclosed(source, place));
+        };
+        let name = field.trim();
+        let fault = |kind, found: String, expected| {
+            Err(Error::new(kind, source, place.clone(), found, expected))
+        };
+        if name.parse::<f64>().is_ok() {
+            return fault(
+                Kind::HeaderMissing,
+                quoted(name),
+                "a header line with a name for each column",
+            );
+        }
+        if name.is_empty() {
+            return fault(
+                Kind::ColumnName,
+                "an empty field".into(),
+                "a name for each column",
+            );
+        }
+        if names.iter().any(|known| known == name) {
+            return fault(
+                Kind::ColumnName,
+                format!("{} again", quoted(name)),
+                "each name once",
+            );
+        }
+        names.push(name.to_owned());
+    }
+    // A name with a separator of other tools in it is such a tool's header line.
+    if let [only] = names.as_slice()
+        && only.contains([';', '\t'])
+        && !header.starts_with('"')
+    {
+        return Err(Error::new(
+            Kind::Format,
+            source,
+            Place::line(line),
+            quoted(only),
+            "names separated by commas",
+        ));
+    }
+    Ok(names)
+}
+
+fn unclosed(source: &str, place: Place) -> Error {
+    Error::new(
+        Kind::Format,
+        source,
+        place,
+        "a quotation mark without its partner",
+        "both on one line",
+    )
+}
+
+/// A field's number, NaN for an empty one.
+fn value(field: &str) -> std::result::Result<f64, Kind> {
+    let field = field.trim_ascii();
+    if field.is_empty() {
+        return Ok(f64::NAN);
+    }
+    let number = field.parse::<f64>().map_err(|_| Kind::NotANumber)?;
+    if number.is_nan() {
+        return Err(Kind::NotANumber);
+    }
+    if number.is_infinite() {
+        return Err(Kind::Infinite);
+    }
+    Ok(number)
+}
+
+/// Lines with their numbers, without their ends; blank ones are left out.
+struct Lines<'a> {
+    rest: Option<&'a str>,
+    number: u64,
+}
+
+impl<'a> Lines<'a> {
+    fn new(text: &'a str) -> Self {
+        Self {
+            rest: Some(text),
+            number: 0,
+        }
+    }
+}
+
+impl<'a> Iterator for Lines<'a> {
+    type Item = (u64, &'a str);
+
+    fn next(&mut self) -> Option<Self::Item> {
+        loop {
+            let rest = self.rest?;
+            let line = match memchr::memchr(b'\n', rest.as_bytes()) {
+                Some(end) => {
+                    self.rest = Some(&rest[end + 1..]);
+                    &rest[..end]
+                }
+                None => {
+                    self.rest = None;
+                    rest
+                }
+            };
+            self.number += 1;
+            let line = line.strip_suffix('\r').unwrap_or(line);
+            if !line.trim_ascii().is_empty() {
+                return Some((self.number, line));
+            }
+        }
+    }
+}
+
+/// The fields of a line; `None` for one whose quotation mark is not closed.
+struct Fields<'a> {
+    rest: Option<&'a str>,
+}
+
+impl<'a> Fields<'a> {
+    fn new(line: &'a str) -> Self {
+        Self { rest: Some(line) }
+    }
+
+    /// A field in quotation marks, a doubled one inside stands for itself.
+    fn quoted(&mut self, after_mark: &'a str) -> Option<Cow<'a, str>> {
+        let mut field = String::new();
+        let mut rest = after_mark;
+        loop {
+            let Some(mark) = memchr::memchr(b'"', rest.as_bytes()) else {
+                self.rest = None;
+                return None;
+            };
+            field.push_str(&rest[..mark]);
+            rest = &rest[mark + 1..];
+            if let Some(inside) = rest.strip_prefix('"') {
+                field.push('"');
+                rest = inside;
+            } else if let Some(next) = rest.strip_prefix(',') {
+                self.rest = Some(next);
+                return Some(field.into());
+            } else {
+                self.rest = None;
+                return rest.is_empty().then(|| field.into());
+            }
+        }
+    }
+}
+
+impl<'a> Iterator for Fields<'a> {
+    type Item = Option<Cow<'a, str>>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let rest = self.rest?;
+        if let Some(after_mark) = rest.strip_prefix('"') {
+            return Some(self.quoted(after_mark));
+        }
+        let field = match memchr::memchr(b',', rest.as_bytes()) {
+            Some(end) => {
+                self.rest = Some(&rest[end + 1..]);
+                &rest[..end]
+            }
+            None => {
+                self.rest = None;
+                rest
+            }
+        };
+        Some(Some(field.into()))
+    }
+}
+
+/// Writes a recording row by row. The file gets its name at `finish`; dropped before, it leaves nothing behind.
+#[derive(Debug)]
+pub struct Writer {
+    file: WholeFile,
+    names: Vec<String>,
+    line: String,
+    rows: u64,
+}
+
+impl Writer {
+    /// Begins a file at `path` with these columns; what is there now stays until `finish`.
+    pub fn create<N: AsRef<str>>(path: &Path, names: &[N]) -> Result<Self> {
+        let mut writer = Self {
+            file: WholeFile::create(path)?,
+            names: names.iter().map(|name| name.as_ref().to_owned()).collect(),
+            line: String::new(),
+            rows: 0,
+        };
+        for (column, name) in writer.names.iter().enumerate() {
+            let readable = !name.is_empty()
+                && name.trim() == name
+                && !name.contains(['\n', '\r', '\u{feff}'])
+                && name.parse::<f64>().is_err()
+                && !writer.names[..column].contains(name);
+            if !readable {
+                return Err(Error::new(
+                    Kind::ColumnName,
+                    path.display().to_string(),
+                    Place::default(),
+                    quoted(name),
+                    "names that differ, on one line, not numbers",
+                ));
+            }
+            if column > 0 {
+                writer.line.push(',');
+            }
+            if name.contains([',', '"', ';', '\t']) {
+                writer.line.push('"');
+                writer.line.push_str(&name.replace('"', "\"\""));
+                writer.line.push('"');
+            } else {
+                writer.line.push_str(name);
+            }
+        }
+        writer.end_line()?;
+        Ok(writer)
+    }
+
+    /// One row, a value for each column; NaN is a missing one. Shortest digits that read back as the same number.
+    pub fn row(&mut self, values: &[f64]) -> Result<()> {
+        if values.len() != self.names.len() {
+            return Err(self.fault(
+                Kind::FieldCount,
+                None,
+                format!("{} values", values.len()),
+                format!("{} as in the header", self.names.len()),
+            ));
+        }
+        let mut digits = zmij::Buffer::new();
+        for (column, &value) in values.iter().enumerate() {
+            if column > 0 {
+                self.line.push(',');
+            }
+            if value.is_nan() {
+                continue;
+            }
+            if value.is_infinite() {
+                self.line.clear();
+                return Err(self.fault(
+                    Kind::Infinite,
+                    Some(column),
+                    "an infinite value".into(),
+                    "a number, or NaN for a missing one".into(),
+                ));
+            }
+            let text = digits.format_finite(value);
+            self.line.push_str(text.strip_suffix(".0").unwrap_or(text));
+        }
+        // One column and no value: a blank line would not be a row.
+        if values.len() == 1 && self.line.is_empty() {
+            self.line.push_str("\"\"");
+        }
+        self.rows += 1;
+        self.end_line()
+    }
+
+    /// Rows written so far.
+    pub fn rows(&self) -> u64 {
+        self.rows
+    }
+
+    /// Where the file will be.
+    pub fn path(&self) -> PathBuf {
+        self.file.path().to_owned()
+    }
+
+    /// All rows are written: the file appears under its name.
+    pub fn finish(self) -> Result<()> {
+        self.file.finish()
+    }
+
+    fn end_line(&mut self) -> Result<()> {
+        self.line.push('\n');
+        let done = self.file.write_all(self.line.as_bytes());
+        self.line.clear();
+        done.map_err(|error| self.file.fault(&error))
+    }
+
+    fn fault(&self, kind: Kind, column: Option<usize>, found: String, expected: String) -> Error {
+        let place = Place {
+            line: Some(self.rows + 2),
+            row: None,
+            offset: None,
+            column: column.map(|column| column + 1),
+            name: column.map(|column| self.names[column].clone()),
+        };
+        Error::new(
+            kind,
+            self.file.path().display().to_string(),
+            place,
+            found,
+            expected,
+        )
+    }
+}
+
+/// Writes whole columns; `progress` is told the share done, 0 … 1.
+pub fn write(path: &Path, columns: &dyn Columns, progress: &mut dyn FnMut(f64)) -> Result<()> {
+    const BLOCK: usize = 4096;
+    let names = columns.names();
+    let mut writer = Writer::create(path, &names)?;
+    let mut block = vec![f64::NAN; BLOCK * names.len()];
+    let mut row = vec![f64::NAN; names.len()];
+    let rows = columns.rows();
+    for first in (0..rows).step_by(BLOCK) {
+        progress(first as f64 / rows as f64);
+        let length = BLOCK.min(rows - first);
+        for (column, values) in block.chunks_exact_mut(BLOCK).enumerate() {
+            columns.fill(column, first, &mut values[..length]);
+        }
+        for index in 0..length {
+            for (value, values) in row.iter_mut().zip(block.chunks_exact(BLOCK)) {
+                *value = values[index];
+            }
+            writer.row(&row)?;
+        }
+    }
+    writer.finish()
+}

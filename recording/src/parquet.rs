@@ -1,0 +1,344 @@
+//! Parquet with the columns of the canonical CSV: one flat column of numbers each, null for a missing value.
+
+use std::{
+    fs,
+    io::Write,
+    panic::{self, AssertUnwindSafe},
+    path::Path,
+    sync::Arc,
+};
+
+use ::parquet::{
+    basic::{Compression, ConvertedType, LogicalType, Repetition, Type as Physical},
+    column::reader::{ColumnReader, ColumnReaderImpl},
+    data_type::{DataType, DoubleType},
+    errors::ParquetError,
+    file::{
+        metadata::ColumnChunkMetaData,
+        properties::WriterProperties,
+        reader::{FileReader, SerializedFileReader},
+        writer::SerializedFileWriter,
+    },
+    schema::types::{ColumnDescriptor, Type},
+};
+use bytes::Bytes;
+
+use crate::{
+    error::{Error, Kind, Place, Result, quoted},
+    output::{Columns, WholeFile},
+    table::Table,
+};
+
+/// Rows that are written, and read, at once.
+const GROUP: usize = 1 << 17;
+
+/// A table, and the columns that were left out because they hold no numbers.
+#[derive(Debug)]
+pub struct Contents {
+    /// The columns of numbers.
+    pub table: Table,
+    /// The others, with the reason.
+    pub left_out: Vec<String>,
+}
+
+/// Reads a table.
+pub fn read(path: &Path) -> Result<Contents> {
+    let bytes = fs::read(path).map_err(|error| Error::reading(path, &error))?;
+    parse(&path.display().to_string(), bytes)
+}
+
+/// Reads a table from memory; `source` is what messages call it.
+pub fn parse(source: &str, bytes: Vec<u8>) -> Result<Contents> {
+    // The crate panics at some damaged pages ("Decoder for dict should have been set"): that is an error of the file too.
+    panic::catch_unwind(AssertUnwindSafe(|| parse_or_panic(source, bytes))).unwrap_or_else(|_| {
+        Err(Error::new(
+            Kind::Format,
+            source,
+            Place::default(),
+            "damaged pages",
+            "a Parquet file",
+        ))
+    })
+}
+
+fn parse_or_panic(source: &str, bytes: Vec<u8>) -> Result<Contents> {
+    let refused = |error: ParquetError| {
+        let kind = match error {
+            ParquetError::NYI(_) => Kind::Unsupported,
+            _ => Kind::Format,
+        };
+        Error::new(
+            kind,
+            source,
+            Place::default(),
+            quoted(&error.to_string()),
+            "a Parquet file",
+        )
+    };
+    let size = bytes.len();
+    let file = SerializedFileReader::new(Bytes::from(bytes)).map_err(refused)?;
+    let schema = file.metadata().file_metadata().schema_descr();
+    let mut columns: Vec<(String, Vec<f64>)> = Vec::new();
+    let mut left_out = Vec::new();
+    for index in 0..schema.num_columns() {
+        let column = schema.column(index);
+        let name = column.path().string();
+        let Some(kind) = number(&column) else {
+            left_out.push(format!("{name} ({:?})", column.physical_type()));
+            continue;
+        };
+        let mut values = Vec::new();
+        for group in 0..file.num_row_groups() {
+            let group = file.get_row_group(group).map_err(refused)?;
+            let chunk = group.metadata().column(index);
+            if !inside(chunk, size) {
+                return Err(Error::new(
+                    Kind::Format,
+                    source,
+                    Place {
+                        name: Some(name),
+                        ..Place::default()
+                    },
+                    "values outside of the file",
+                    "all of them inside",
+                ));
+            }
+            let packing = chunk.compression();
+            if !matches!(
+                packing,
+                Compression::UNCOMPRESSED | Compression::SNAPPY | Compression::GZIP(_)
+            ) {
+                return Err(Error::new(
+                    Kind::Unsupported,
+                    source,
+                    Place {
+                        name: Some(name),
+                        ..Place::default()
+                    },
+                    format!("values packed by {packing}"),
+                    "none, snappy or gzip",
+                ));
+            }
+            let reader = group.get_column_reader(index).map_err(refused)?;
+            let rows = group.metadata().num_rows();
+            let read = column_values(reader, kind, &mut values).map_err(refused)?;
+            if i64::try_from(read) != Ok(rows) {
+                return Err(Error::new(
+                    Kind::FieldCount,
+                    source,
+                    Place {
+                        name: Some(name),
+                        ..Place::default()
+                    },
+                    format!("{read} values in a row group"),
+                    format!("{rows}, as it says"),
+                ));
+            }
+        }
+        if let Some(row) = values.iter().position(|value| value.is_infinite()) {
+            return Err(Error::new(
+                Kind::Infinite,
+                source,
+                Place {
+                    row: Some(row as u64 + 1),
+                    name: Some(name),
+                    ..Place::default()
+                },
+                "an infinite value",
+                "a number, or null for a missing one",
+            ));
+        }
+        columns.push((name, values));
+    }
+    Ok(Contents {
+        table: Table::new(source, columns)?,
+        left_out,
+    })
+}
+
+/// Whether a column's piece lies inside of a file of `size` bytes: the reader takes that for granted.
+fn inside(chunk: &ColumnChunkMetaData, size: usize) -> bool {
+    let start = chunk
+        .dictionary_page_offset()
+        .unwrap_or(chunk.data_page_offset());
+    let end = start.checked_add(chunk.compressed_size());
+    start >= 0
+        && chunk.data_page_offset() >= 0
+        && chunk.compressed_size() >= 0
+        && chunk.num_values() >= 0
+        && end.is_some_and(|end| usize::try_from(end).is_ok_and(|end| end <= size))
+}
+
+/// How a column's numbers are meant.
+#[derive(Clone, Copy, Debug)]
+enum Number {
+    /// As they are.
+    Plain,
+    /// Whole numbers without a sign.
+    Unsigned,
+}
+
+/// `None` for columns that hold something else, such as text, dates or lists.
+fn number(column: &ColumnDescriptor) -> Option<Number> {
+    if column.max_rep_level() > 0 || column.max_def_level() > 1 {
+        return None;
+    }
+    let whole = match (column.logical_type_ref(), column.converted_type()) {
+        (Some(LogicalType::Integer(whole)), _) if whole.is_signed => Number::Plain,
+        (Some(LogicalType::Integer(_)), _) => Number::Unsigned,
+        (Some(_), _) => return None,
+        (
+            None,
+            ConvertedType::NONE
+            | ConvertedType::INT_8
+            | ConvertedType::INT_16
+            | ConvertedType::INT_32
+            | ConvertedType::INT_64,
+        ) => Number::Plain,
+        (
+            None,
+            ConvertedType::UINT_8
+            | ConvertedType::UINT_16
+            | ConvertedType::UINT_32
+            | ConvertedType::UINT_64,
+        ) => Number::Unsigned,
+        _ => return None,
+    };
+    matches!(
+        column.physical_type(),
+        Physical::BOOLEAN | Physical::INT32 | Physical::INT64 | Physical::FLOAT | Physical::DOUBLE
+    )
+    .then_some(whole)
+}
+
+/// Appends a column's values, NaN for null, and says how many.
+fn column_values(
+    reader: ColumnReader,
+    kind: Number,
+    values: &mut Vec<f64>,
+) -> std::result::Result<usize, ParquetError> {
+    match (reader, kind) {
+        (ColumnReader::BoolColumnReader(reader), _) => {
+            append(reader, values, |&value| f64::from(u8::from(value)))
+        }
+        (ColumnReader::Int32ColumnReader(reader), Number::Plain) => {
+            append(reader, values, |&value| f64::from(value))
+        }
+        (ColumnReader::Int32ColumnReader(reader), Number::Unsigned) => {
+            append(reader, values, |&value| f64::from(value.cast_unsigned()))
+        }
+        (ColumnReader::Int64ColumnReader(reader), Number::Plain) => {
+            append(reader, values, |&value| value as f64)
+        }
+        (ColumnReader::Int64ColumnReader(reader), Number::Unsigned) => {
+            append(reader, values, |&value| value.cast_unsigned() as f64)
+        }
+        (ColumnReader::FloatColumnReader(reader), _) => {
+            append(reader, values, |&value| f64::from(value))
+        }
+        (ColumnReader::DoubleColumnReader(reader), _) => append(reader, values, |&value| value),
+        _ => Err(ParquetError::General("a column of another type".into())),
+    }
+}
+
+fn append<T: DataType>(
+    mut reader: ColumnReaderImpl<T>,
+    values: &mut Vec<f64>,
+    number: impl Fn(&T::T) -> f64,
+) -> std::result::Result<usize, ParquetError> {
+    let before = values.len();
+    let (mut levels, mut present) = (Vec::new(), Vec::new());
+    loop {
+        levels.clear();
+        present.clear();
+        let (rows, _, _) = reader.read_records(GROUP, Some(&mut levels), None, &mut present)?;
+        if rows == 0 {
+            return Ok(values.len() - before);
+        }
+        let mut present = present.iter().map(&number);
+        if levels.is_empty() {
+            values.extend(present);
+        } else {
+            // A level of 1 is a value, one of 0 is null.
+            values.extend(levels.iter().map(|&level| {
+                let value = if level > 0 { present.next() } else { None };
+                value.unwrap_or(f64::NAN)
+            }));
+        }
+    }
+}
+
+/// Writes whole columns; `progress` is told the share done, 0 … 1.
+pub fn write(path: &Path, columns: &dyn Columns, progress: &mut dyn FnMut(f64)) -> Result<()> {
+    let refused = |error: ParquetError| {
+        Error::new(
+            Kind::Io,
+            path.display().to_string(),
+            Place::default(),
+            quoted(&error.to_string()),
+            "a file that can be written",
+        )
+    };
+    let names = columns.names();
+    let fields = names.iter().map(|name| {
+        let field = Type::primitive_type_builder(name, Physical::DOUBLE);
+        field
+            .with_repetition(Repetition::OPTIONAL)
+            .build()
+            .map(Arc::new)
+    });
+    let fields: Vec<_> = fields
+        .collect::<std::result::Result<_, _>>()
+        .map_err(refused)?;
+    let schema = Type::group_type_builder("recording")
+        .with_fields(fields)
+        .build()
+        .map_err(refused)?;
+    // Snappy is what every reader has.
+    let properties = WriterProperties::builder()
+        .set_compression(Compression::SNAPPY)
+        .build();
+    let file = WholeFile::create(path)?;
+    let mut writer =
+        SerializedFileWriter::new(file, Arc::new(schema), Arc::new(properties)).map_err(refused)?;
+    let rows = columns.rows();
+    let (mut values, mut levels) = (Vec::new(), Vec::new());
+    for first in (0..rows).step_by(GROUP) {
+        let mut group = writer.next_row_group().map_err(refused)?;
+        let mut column = 0;
+        while let Some(mut chunk) = group.next_column().map_err(refused)? {
+            let length = GROUP.min(rows - first);
+            let share = column as f64 / names.len() as f64;
+            progress((first as f64 + share * length as f64) / rows as f64);
+            values.resize(length, 0.0);
+            columns.fill(column, first, &mut values);
+            if let Some(row) = values.iter().position(|value: &f64| value.is_infinite()) {
+                return Err(Error::new(
+                    Kind::Infinite,
+                    path.display().to_string(),
+                    Place {
+                        row: Some((first + row) as u64 + 1),
+                        column: Some(column + 1),
+                        name: names.get(column).map(|&name| name.to_owned()),
+                        ..Place::default()
+                    },
+                    "an infinite value",
+                    "a number, or NaN for a missing one",
+                ));
+            }
+            levels.clear();
+            levels.extend(values.iter().map(|value| i16::from(!value.is_nan())));
+            values.retain(|value| !value.is_nan());
+            chunk
+                .typed::<DoubleType>()
+                .write_batch(&values, Some(&levels), None)
+                .map_err(refused)?;
+            chunk.close().map_err(refused)?;
+            column += 1;
+        }
+        group.close().map_err(refused)?;
+    }
+    let mut file = writer.into_inner().map_err(refused)?;
+    file.flush().map_err(|error| Error::writing(path, &error))?;
+    file.finish()
+}

@@ -1,0 +1,213 @@
+//! Columns of numbers by name.
+
+use std::collections::HashSet;
+
+use crate::{
+    error::{Error, Kind, Place, Result, listed, quoted},
+    mapping::Mapping,
+    output::Columns,
+    series::Recording,
+};
+
+/// Columns of equal length, NaN where a value is missing. A table need not have time: an OCV curve has none.
+#[derive(Clone, Debug)]
+pub struct Table {
+    source: String,
+    columns: Vec<Column>,
+    /// The line of each row; empty if row `n` is simply row `n + 1` of its file.
+    lines: Vec<u64>,
+}
+
+#[derive(Clone, Debug)]
+struct Column {
+    name: String,
+    /// Position in its file, from 0.
+    position: usize,
+    values: Vec<f64>,
+}
+
+impl Table {
+    /// A table that was not read from a file with lines; `source` is what messages call it.
+    pub fn new(source: impl Into<String>, columns: Vec<(String, Vec<f64>)>) -> Result<Self> {
+        Self::with_lines(source, columns, Vec::new())
+    }
+
+    /// A table with the line of each row.
+    pub(crate) fn with_lines(
+        source: impl Into<String>,
+        columns: Vec<(String, Vec<f64>)>,
+        lines: Vec<u64>,
+    ) -> Result<Self> {
+        let source = source.into();
+        let header = |kind, found: String, expected: &str| {
+            Err(Error::new(
+                kind,
+                source.as_str(),
+                Place::default(),
+                found,
+                expected,
+            ))
+        };
+        let mut seen = HashSet::new();
+        let rows = columns.first().map_or(0, |(_, values)| values.len());
+        for (name, values) in &columns {
+            if name.is_empty() {
+                return header(
+                    Kind::ColumnName,
+                    "a column without a name".into(),
+                    "a name for each column",
+                );
+            }
+            if !seen.insert(name.as_str()) {
+                return header(
+                    Kind::ColumnName,
+                    format!("column {} twice", quoted(name)),
+                    "each name once",
+                );
+            }
+            if values.len() != rows {
+                return header(
+                    Kind::FieldCount,
+                    format!("{} values in column {}", values.len(), quoted(name)),
+                    &format!("{rows} as in the first column"),
+                );
+            }
+        }
+        if rows == 0 {
+            return header(Kind::Empty, "no rows".into(), "at least one row of numbers");
+        }
+        let columns = columns
+            .into_iter()
+            .enumerate()
+            .map(|(position, (name, values))| Column {
+                name,
+                position,
+                values,
+            })
+            .collect();
+        Ok(Self {
+            source,
+            columns,
+            lines,
+        })
+    }
+
+    /// The file it came from, as messages name it.
+    pub fn source(&self) -> &str {
+        &self.source
+    }
+
+    /// Names of the columns, in their order.
+    pub fn names(&self) -> impl ExactSizeIterator<Item = &str> {
+        self.columns.iter().map(|column| column.name.as_str())
+    }
+
+    /// The columns, in their order.
+    pub fn columns(&self) -> impl ExactSizeIterator<Item = (&str, &[f64])> {
+        self.columns
+            .iter()
+            .map(|column| (column.name.as_str(), column.values.as_slice()))
+    }
+
+    /// A column by its name.
+    pub fn column(&self, name: &str) -> Option<&[f64]> {
+        self.find(name).map(|column| column.values.as_slice())
+    }
+
+    /// A column that must be there.
+    pub fn need(&self, name: &str) -> Result<&[f64]> {
+        self.column(name).ok_or_else(|| self.lacks(name))
+    }
+
+    /// Number of rows, at least one.
+    #[expect(clippy::len_without_is_empty, reason = "it is never empty")]
+    pub fn len(&self) -> usize {
+        self.columns.first().map_or(0, |column| column.values.len())
+    }
+
+    /// The line of the file that row `row` (from 0) came from, from 1; the number of the row where a file has no lines.
+    pub fn line(&self, row: usize) -> u64 {
+        self.lines.get(row).copied().unwrap_or(row as u64 + 1)
+    }
+
+    /// An error that points at a value: `found` and `expected` end the sentence "found …, expected …".
+    pub fn error_at(
+        &self,
+        kind: Kind,
+        row: usize,
+        name: &str,
+        found: impl Into<String>,
+        expected: impl Into<String>,
+    ) -> Error {
+        let number = Some(self.line(row));
+        let has_lines = !self.lines.is_empty();
+        let place = Place {
+            line: number.filter(|_| has_lines),
+            row: number.filter(|_| !has_lines),
+            offset: None,
+            column: self.find(name).map(|column| column.position + 1),
+            name: Some(name.to_owned()),
+        };
+        Error::new(kind, self.source.as_str(), place, found, expected)
+    }
+
+    /// The columns under the names that `mapping` gives them; those it does not speak of keep theirs.
+    pub fn mapped(mut self, mapping: &Mapping) -> Result<Self> {
+        let mut columns = Vec::new();
+        let mut taken = HashSet::new();
+        for (name, from) in mapping.pairs() {
+            let column = self.find(from).ok_or_else(|| self.lacks(from))?;
+            taken.insert(from);
+            columns.push(Column {
+                name: name.to_owned(),
+                ..column.clone()
+            });
+        }
+        let named: HashSet<&str> = mapping.pairs().map(|(name, _)| name).collect();
+        columns.extend(
+            std::mem::take(&mut self.columns)
+                .into_iter()
+                .filter(|column| {
+                    !taken.contains(column.name.as_str()) && !named.contains(column.name.as_str())
+                }),
+        );
+        columns.sort_by_key(|column| column.position);
+        self.columns = columns;
+        Ok(self)
+    }
+
+    /// With its time checked.
+    pub fn into_recording(self) -> Result<Recording> {
+        Recording::from_table(self)
+    }
+
+    fn find(&self, name: &str) -> Option<&Column> {
+        self.columns.iter().find(|column| column.name == name)
+    }
+
+    fn lacks(&self, name: &str) -> Error {
+        Error::new(
+            Kind::ColumnMissing,
+            self.source.as_str(),
+            Place::default(),
+            format!("the columns {}", listed(self.names())),
+            format!("a column {}", quoted(name)),
+        )
+    }
+}
+
+impl Columns for Table {
+    fn names(&self) -> Vec<&str> {
+        Table::names(self).collect()
+    }
+
+    fn rows(&self) -> usize {
+        self.len()
+    }
+
+    fn fill(&self, column: usize, first: usize, values: &mut [f64]) {
+        if let Some(column) = self.columns.get(column) {
+            values.copy_from_slice(&column.values[first..first + values.len()]);
+        }
+    }
+}

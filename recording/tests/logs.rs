@@ -1,0 +1,680 @@
+//! Logs of CAN frames and the database that decodes them, case by case.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use proptest::prelude::*;
+use recording::{
+    Error, Mapping, Recording,
+    dbc::{Database, Decoded, Decoder},
+    error::Kind,
+    log::{self, Counts, DATA_BYTES, Frame},
+    merge::Merged,
+};
+
+type Reader = fn(&str, &[u8], &mut log::Sink<'_>) -> Result<Counts, Error>;
+
+const READERS: [Reader; 3] = [
+    |source, bytes, sink| log::candump::read(source, bytes, sink),
+    |source, bytes, sink| log::asc::read(source, bytes, sink),
+    |source, bytes, sink| log::blf::read(source, bytes, sink),
+];
+const CANDUMP: Reader = READERS[0];
+const ASC: Reader = READERS[1];
+const BLF: Reader = READERS[2];
+
+/// A frame as a test writes it: time in ns, bus, identifier (negative: 29 bits), data.
+type Plain = (i64, String, i64, Vec<u8>);
+
+fn read(reader: Reader, bytes: &[u8]) -> Result<(Vec<Plain>, Counts), Error> {
+    let mut frames = Vec::new();
+    let counts = reader("log", bytes, &mut |frame| {
+        let id = i64::from(frame.id) * if frame.extended { -1 } else { 1 };
+        assert!(frame.data[frame.length..].iter().all(|&byte| byte == 0));
+        let data = frame.data[..frame.length].to_vec();
+        frames.push((frame.time_ns, frame.bus.to_owned(), id, data));
+        Ok(())
+    })?;
+    Ok((frames, counts))
+}
+
+fn plain(time_ns: i64, bus: &str, id: i64, data: &[u8]) -> Plain {
+    (time_ns, bus.to_owned(), id, data.to_vec())
+}
+
+#[test]
+fn candump_lines() {
+    let log = "(1436509052.249713) vcan0 044#2A366C2BBA\n\
+        (1436509053.850870) can1 00000001#\n\
+        \n\
+        (1436509053.9) can1 7FF#R4\r\n\
+        (1436509053.95) can1 20000080#0000000000000000\n\
+        (1436509054.000000001) can1 1FFFFFFF#01.02.03 T\n\
+        (1436509054.1) can1 123#1122334455667788_B R\n";
+    let (frames, counts) = read(CANDUMP, log.as_bytes()).unwrap();
+    assert_eq!(
+        frames,
+        [
+            plain(
+                1_436_509_052_249_713_000,
+                "vcan0",
+                0x44,
+                &[0x2A, 0x36, 0x6C, 0x2B, 0xBA]
+            ),
+            plain(1_436_509_053_850_870_000, "can1", -1, &[]),
+            plain(1_436_509_054_000_000_001, "can1", -0x1FFF_FFFF, &[1, 2, 3]),
+            plain(
+                1_436_509_054_100_000_000,
+                "can1",
+                0x123,
+                &[0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88]
+            ),
+        ]
+    );
+    assert_eq!((counts.frames, counts.remote, counts.errors), (4, 1, 1));
+}
+
+#[test]
+fn candump_faults_have_their_place() {
+    let cases = [
+        (
+            "x",
+            "log, line 1, column 1: found \"x\", expected a time such as (1436509052.249713)",
+        ),
+        (
+            "(1.0)",
+            "log, line 1, column 2: found \"\", expected an interface such as can0",
+        ),
+        (
+            "\n(1.0) can0 123",
+            "log, line 2, column 3: found \"123\", expected a frame such as 123#DEADBEEF",
+        ),
+        (
+            "(1.0) can0 123##0AA",
+            "log, line 1: found a CAN FD frame, expected classic CAN frames",
+        ),
+        (
+            "(1.0) can0 1234#00",
+            "log, line 1, column 3: found \"1234#00\", expected an identifier of 3 or 8 hexadecimal digits",
+        ),
+        (
+            "(1.0) can0 +12#00",
+            "log, line 1, column 3: found \"+12#00\", expected an identifier of 3 or 8 hexadecimal digits",
+        ),
+        (
+            "(1.0) can0 800#00",
+            "log, line 1, column 3: found \"800#00\", expected an identifier of 11 or 29 bits",
+        ),
+        (
+            "(1.0) can0 123#0",
+            "log, line 1, column 3: found \"123#0\", expected up to eight bytes of two hexadecimal digits after #",
+        ),
+        (
+            "(1.0) can0 123#00112233445566778899",
+            "log, line 1, column 3: found \"123#00112233445566778899\", expected up to eight bytes of two hexadecimal digits after #",
+        ),
+        (
+            "(1.0) can0 123#00 X",
+            "log, line 1, column 4: found \"X\", expected R, T or the end of the line",
+        ),
+    ];
+    for (log, sentence) in cases {
+        assert_eq!(
+            read(CANDUMP, log.as_bytes()).unwrap_err().to_string(),
+            sentence
+        );
+    }
+}
+
+const ASC_EVENTS: &str = "Begin Triggerblock Fri M\u{e4}r 1 10:00:00.000 am 2024
+   0.000000 Start of measurement
+   0.015991 CAN 1 Status:chip status error active
+   0.500000 1  390x            Rx   d 3 16 17 99  Length = 256215 BitCount = 130 ID = 912
+   0.750000 2  20              Tx   d 0
+   1.000000 1  Statistic: D 0 R 0 XD 0 XR 0 E 0 O 0 B 0.00%
+   1.000000 1  ErrorFrame
+   1.250000 1  20              TxRq d 1 01
+   1.500000 1  20              Rx   r
+// a comment
+   2.000000 1  7               Rx   d 8 1 2 3 4 5 6 7 8
+End TriggerBlock
+";
+
+#[test]
+fn vector_ascii_in_either_base_and_either_time() {
+    let data = [1, 2, 3, 4, 5, 6, 7, 8];
+    let absolute = |base: u32| {
+        let id = |text| i64::from_str_radix(text, base).unwrap();
+        let byte = |text| u8::from_str_radix(text, base).unwrap();
+        [
+            plain(
+                500_000_000,
+                "1",
+                -id("390"),
+                &[byte("16"), byte("17"), byte("99")],
+            ),
+            plain(750_000_000, "2", id("20"), &[]),
+            plain(2_000_000_000, "1", 7, &data),
+        ]
+    };
+    for (header, base) in [
+        ("base hex  timestamps absolute", 16),
+        ("base dec timestamps absolute", 10),
+    ] {
+        let log = format!("date Fri Mar 1 2024\n{header}\nno internal events logged\n{ASC_EVENTS}");
+        // The month of a German computer is not UTF-8.
+        let bytes: Vec<u8> = log
+            .chars()
+            .map(|letter| u8::try_from(letter).unwrap())
+            .collect();
+        let (frames, counts) = read(ASC, &bytes).unwrap();
+        assert_eq!(frames, absolute(base));
+        assert_eq!((counts.remote, counts.errors, counts.others), (1, 1, 4));
+    }
+    // Each time counts from the line before, whatever that is.
+    let log = format!("base hex timestamps relative\n{ASC_EVENTS}");
+    let (frames, _) = read(ASC, log.as_bytes()).unwrap();
+    let times: Vec<_> = frames.iter().map(|frame| frame.0).collect();
+    let sums_ms = [516, 1266, 8016];
+    assert!(
+        times
+            .iter()
+            .zip(sums_ms)
+            .all(|(ns, ms)| (ns + 500_000) / 1_000_000 == ms),
+        "{times:?}"
+    );
+}
+
+#[test]
+fn vector_ascii_faults_have_their_place() {
+    let cases = [
+        (
+            "",
+            "log: found no header, expected \"base hex\" or \"base dec\" in one of the first lines",
+        ),
+        (
+            "date x\n0.1 1 20 Rx d 0",
+            "log, line 2: found \"0.1 1 20 Rx d 0\", expected a header with \"base hex\" or \"base dec\" before the first event",
+        ),
+        (
+            "base hex\n0.x 1 20 Rx d 0",
+            "log, line 2, column 1: found \"0.x\", expected a time in seconds",
+        ),
+        (
+            "base hex\n0.1 1 800 Rx d 0",
+            "log, line 2, column 3: found \"800\", expected an identifier of 11 bits, or of 29 and an x",
+        ),
+        (
+            "base dec\n0.1 1 1FFx Rx d 0",
+            "log, line 2, column 3: found \"1FFx\", expected an identifier of 11 bits, or of 29 and an x",
+        ),
+        (
+            "base hex\n0.1 1 20 Rx q 0",
+            "log, line 2, column 5: found \"q\", expected d for data or r for a remote frame",
+        ),
+        (
+            "base hex\n0.1 1 20 Rx d 10",
+            "log, line 2, column 6: found \"10\", expected a length code of 0 to 15",
+        ),
+        (
+            "base hex\n0.1 1 20 Rx d 2 00 100",
+            "log, line 2, column 8: found \"100\", expected a byte",
+        ),
+        (
+            "base hex\n0.1 1 20 Rx d 2 00",
+            "log, line 2, column 8: found \"\", expected a byte",
+        ),
+        (
+            "base hex\n0.1 CANFD 1 Rx 20 1 0 9 12 00",
+            "log, line 2: found a CAN FD frame, expected classic CAN frames",
+        ),
+    ];
+    for (log, sentence) in cases {
+        assert_eq!(read(ASC, log.as_bytes()).unwrap_err().to_string(), sentence);
+    }
+}
+
+#[test]
+fn vector_binary_faults_have_their_place() {
+    let header = {
+        let mut header = b"LOGG".to_vec();
+        header.extend(144_u32.to_le_bytes());
+        header.resize(144, 0);
+        header
+    };
+    let object = |kind: u32, body: &[u8]| {
+        let mut object = b"LOBJ".to_vec();
+        object.extend([32, 0, 1, 0]);
+        object.extend((32 + body.len() as u32).to_le_bytes());
+        object.extend(kind.to_le_bytes());
+        object.extend(2_u32.to_le_bytes());
+        object.extend([0; 4]);
+        object.extend(5_u64.to_le_bytes());
+        object.extend(body);
+        object
+    };
+    let log = |objects: &[u8]| [header.clone(), objects.to_vec()].concat();
+
+    // Objects may stand outside of containers; data beyond the length code is left out.
+    let message = [2, 0, 0, 3, 0x23, 1, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8];
+    let (frames, _) = read(BLF, &log(&object(1, &message))).unwrap();
+    assert_eq!(frames, [plain(5, "2", 0x123, &[1, 2, 3])]);
+
+    // A classic frame in an object for CAN FD, and one that is not classic.
+    let mut fd = vec![
+        1, 0, 0, 2, 0x23, 1, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0xAA, 0xBB,
+    ];
+    fd.resize(84, 0);
+    let (frames, _) = read(BLF, &log(&object(100, &fd))).unwrap();
+    assert_eq!(frames, [plain(5, "1", 0x123, &[0xAA, 0xBB])]);
+    fd[13] = 1;
+    assert_eq!(
+        read(BLF, &log(&object(100, &fd))).unwrap_err().to_string(),
+        "log, byte 144: found a CAN FD frame, expected classic CAN frames"
+    );
+
+    let whole = log(&object(1, &message));
+    for (bytes, sentence) in [
+        (
+            b"LOBJ".to_vec(),
+            "log, byte 0: found another kind of file, expected a BLF file, beginning with LOGG",
+        ),
+        (
+            whole[..100].to_vec(),
+            "log, byte 4: found a header of 144 bytes, expected one that fits the file",
+        ),
+        (
+            whole[..150].to_vec(),
+            "log, byte 144: found no object, expected an object that begins with LOBJ",
+        ),
+        (
+            whole[..180].to_vec(),
+            "log, byte 144: found the end of the file, expected the rest of this object",
+        ),
+        (
+            log(&object(
+                10,
+                &[2, 0, 0, 0, 0, 0, 0, 0, 9, 0, 0, 0, 0, 0, 0, 0, 1, 2, 3],
+            )),
+            "log, byte 144: found \"corrupt deflate stream\", expected a container packed by zlib",
+        ),
+    ] {
+        assert_eq!(read(BLF, &bytes).unwrap_err().to_string(), sentence);
+    }
+}
+
+const DATABASE: &str = r#"VERSION ""
+
+NS_ :
+
+BS_:
+
+BU_: A
+
+BO_ 16 Shunt: 8 A
+ SG_ Current : 0|16@1- (1,0) [0|0] "mA" A
+ SG_ Page M : 16|8@1+ (1,0) [0|0] "" A
+ SG_ Volt m1 : 24|16@1+ (0.001,0) [0|0] "V" A
+ SG_ Temp m2 : 24|8@1+ (1,-40) [0|0] "degC" A
+
+BO_ 17 Other: 8 A
+ SG_ Level : 7|8@0+ (0.5,0) [0|0] "%" A
+"#;
+
+fn decode_with(
+    database: &str,
+    log: &str,
+    bus: Option<&str>,
+) -> Result<(Recording, Decoded), Error> {
+    let database = Database::parse("v.dbc", database.as_bytes())?;
+    let mut decoder = Decoder::new(&database, "log", bus, true);
+    log::candump::read("log", log.as_bytes(), &mut |frame: &Frame<'_>| {
+        decoder.frame(frame)
+    })?;
+    let (series, decoded) = decoder.finish();
+    Ok((Merged::new("log", series)?.recording()?, decoded))
+}
+
+fn decode(log: &str) -> Result<(Recording, Decoded), Error> {
+    decode_with(DATABASE, log, None)
+}
+
+/// Missing values as -1, so that they can be compared.
+fn column(recording: &Recording, name: &str) -> Vec<f64> {
+    let values = recording.need(name).unwrap().iter();
+    values
+        .map(|value| if value.is_nan() { -1.0 } else { *value })
+        .collect()
+}
+
+#[test]
+fn rows_are_the_times_of_all_messages_and_nothing_is_filled() {
+    let (read, decoded) = decode(
+        "(1700000000.000001) can0 010#E803010810\n\
+         (1700000000.100001) can0 011#14\n\
+         (1700000000.200001) can0 010#18FC0250\n\
+         (1700000000.200001) can0 011#15\n\
+         (1700000000.200001) can0 011#16\n\
+         (1700000000.300001) can0 010#0000070000\n\
+         (1700000000.400001) can0 7FF#00\n\
+         (1700000000.500001) can0 010#0100\n",
+    )
+    .unwrap();
+    assert_eq!(read.time_s(), [0.0, 0.1, 0.2, 0.2, 0.3, 0.5]);
+    assert_eq!(
+        column(&read, "Shunt.Current_a"),
+        [1.0, -1.0, -1.0, -1.0, 0.0, 0.001]
+    );
+    assert_eq!(
+        read.need("Shunt.Current_a").unwrap()[2],
+        -1.0,
+        "measured, not missing"
+    );
+    assert_eq!(
+        column(&read, "Shunt.Page"),
+        [1.0, -1.0, 2.0, -1.0, 7.0, -1.0]
+    );
+    assert_eq!(
+        column(&read, "Shunt.Volt_v"),
+        [4.104, -1.0, -1.0, -1.0, -1.0, -1.0]
+    );
+    assert_eq!(
+        column(&read, "Shunt.Temp_c"),
+        [-1.0, -1.0, 40.0, -1.0, -1.0, -1.0]
+    );
+    assert_eq!(
+        column(&read, "Other.Level_pct"),
+        [-1.0, 10.0, 10.5, 11.0, -1.0, -1.0]
+    );
+    assert_eq!((decoded.frames, decoded.unknown, decoded.short), (7, 1, 1));
+}
+
+#[test]
+fn small_disorder_is_put_right_and_a_set_clock_is_refused() {
+    let (read, decoded) = decode(
+        "(10.0) can0 010#0100\n(10.5) can0 010#0200\n(10.25) can0 010#0300\n(10.25) can0 010#0400\n",
+    )
+    .unwrap();
+    assert_eq!(read.time_s(), [0.0, 0.25, 0.25, 0.5]);
+    assert_eq!(
+        column(&read, "Shunt.Current_a"),
+        [0.001, 0.003, 0.004, 0.002]
+    );
+    assert_eq!(decoded.disordered, 2);
+    let error = decode("(10.0) can0 010#0100\n(8.5) can0 010#0200\n").unwrap_err();
+    assert_eq!(error.kind(), Kind::TimeBackwards);
+    assert_eq!(
+        error.to_string(),
+        "log, line 2: found -1.5 s, expected a time not more than 1 s before the last one, 0 s"
+    );
+}
+
+#[test]
+fn of_two_buses_one_must_be_chosen() {
+    let log = "(1.0) can0 010#0100\n(1.1) can1 010#0200\n";
+    let error = decode(log).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "log, line 2: found the identifier 0x10 on \"can1\" after \"can0\", expected it on one bus, or the bus to be chosen"
+    );
+    let (read, _) = decode_with(DATABASE, log, Some("can1")).unwrap();
+    assert_eq!(column(&read, "Shunt.Current_a"), [0.002]);
+}
+
+#[test]
+fn a_log_without_a_known_signal_is_no_recording() {
+    let error = decode("(1.0) can0 7FF#0100\n").unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "log: found no values, expected at least one signal that the database describes"
+    );
+}
+
+#[test]
+fn signals_get_the_names_that_are_asked_for() {
+    let database = Database::parse("v.dbc", DATABASE.as_bytes()).unwrap();
+    let merged = || {
+        let mut decoder = Decoder::new(&database, "log", None, true);
+        let log = "(1.0) can0 010#0100010000\n(1.1) can0 011#02\n";
+        log::candump::read("log", log.as_bytes(), &mut |frame: &Frame<'_>| {
+            decoder.frame(frame)
+        })
+        .unwrap();
+        Merged::new("log", decoder.finish().0).unwrap()
+    };
+    let mapped = |argument| merged().mapped(&Mapping::parse([argument]).unwrap());
+    // With the unit's ending or without, and with its sign turned.
+    for (argument, value) in [
+        ("i_ref_a=Shunt.Current", 0.001),
+        ("i_ref_a=Shunt.Current_a", 0.001),
+        ("i_ref_a=-Shunt.Current", -0.001),
+    ] {
+        let read = mapped(argument).unwrap().recording().unwrap();
+        assert_eq!(read.need("i_ref_a").unwrap()[0], value);
+        assert!(read.column("Shunt.Current_a").is_none());
+    }
+    assert_eq!(
+        mapped("v_cell_v=Shunt.Current").unwrap_err().to_string(),
+        "log: found \"Shunt.Current\" in A, expected V, as \"v_cell_v\" ends"
+    );
+    assert_eq!(
+        mapped("v_cell_v=Shunt.Voltage").unwrap_err().to_string(),
+        "log: found the signals Shunt.Current_a, Shunt.Page, Shunt.Volt_v, Shunt.Temp_c, Other.Level_pct, \
+         expected a signal \"Shunt.Voltage\""
+    );
+}
+
+#[test]
+fn databases_that_cannot_be_followed_are_placed() {
+    let with = |line: &str| format!("{DATABASE}\nBO_ 18 Third: 8 A\n{line}\n");
+    let cases = [
+        (
+            "VERSION \"\"\nBU_: A\nBO_ 16 Shunt: x A\n".to_owned(),
+            "v.dbc, line 3, column 15: found what is no part of a DBC there, expected a DBC file",
+        ),
+        (
+            with(" SG_ Wide : 0|65@1+ (1,0) [0|0] \"\" A"),
+            "v.dbc, column Third.Wide: found a signal of 65 bits, expected 1 to 64",
+        ),
+        (
+            with(" SG_ Paged m1 : 0|8@1+ (1,0) [0|0] \"\" A"),
+            "v.dbc, column Third.Paged: found the multiplexer \"M\", expected a multiplexer in the same message",
+        ),
+        (
+            with(" SG_ Half : 0|16@1+ (1,0) [0|0] \"\" A\nSIG_VALTYPE_ 18 Half : 1;"),
+            "v.dbc, column Third.Half: found a floating-point signal of 16 bits, expected 32",
+        ),
+        (
+            with(
+                " SG_ X m0M : 0|8@1+ (1,0) [0|0] \"\" A\n SG_ Y M : 0|8@1+ (1,0) [0|0] \"\" A\nSG_MUL_VAL_ 18 Y X 0-0;",
+            ),
+            "v.dbc, column Third.X: found a multiplexer that depends on itself, expected a chain of multiplexers with an end",
+        ),
+    ];
+    for (database, sentence) in cases {
+        let error = Database::parse("v.dbc", database.as_bytes()).unwrap_err();
+        assert_eq!(error.to_string(), sentence);
+    }
+}
+
+#[test]
+fn units_of_editors_that_write_latin_1_are_known() {
+    let mut bytes = DATABASE.replace("degC", "@C").into_bytes();
+    for byte in &mut bytes {
+        if *byte == b'@' {
+            *byte = 0xB0;
+        }
+    }
+    // The byte order marks are at signs as well: put them back.
+    let mut text = Vec::new();
+    for (index, byte) in bytes.iter().enumerate() {
+        let of_unit = bytes.get(index + 1) == Some(&b'C');
+        text.push(if *byte == 0xB0 && !of_unit {
+            b'@'
+        } else {
+            *byte
+        });
+    }
+    let database = Database::parse("v.dbc", &text).unwrap();
+    let mut decoder = Decoder::new(&database, "log", None, true);
+    let log = "(1.0) can0 010#0000024100\n";
+    log::candump::read("log", log.as_bytes(), &mut |frame: &Frame<'_>| {
+        decoder.frame(frame)
+    })
+    .unwrap();
+    let read = Merged::new("log", decoder.finish().0)
+        .unwrap()
+        .recording()
+        .unwrap();
+    assert_eq!(column(&read, "Shunt.Temp_c"), [25.0]);
+}
+
+/// Every bit of a signal, by the definition of both byte orders, one bit after the other.
+fn raw_by_definition(
+    data: &[u8; DATA_BYTES],
+    big_endian: bool,
+    start: u64,
+    size: u64,
+) -> Option<u64> {
+    let mut raw = 0;
+    let (mut byte, mut bit) = (start / 8, start % 8);
+    for index in 0..size {
+        let value = u64::from(*data.get(usize::try_from(byte).unwrap())? >> bit & 1);
+        if big_endian {
+            raw = raw << 1 | value;
+            (byte, bit) = if bit == 0 {
+                (byte + 1, 7)
+            } else {
+                (byte, bit - 1)
+            };
+        } else {
+            raw |= value << index;
+            (byte, bit) = if bit == 7 {
+                (byte + 1, 0)
+            } else {
+                (byte, bit + 1)
+            };
+        }
+    }
+    Some(raw)
+}
+
+fn any_log() -> impl Strategy<Value = Vec<u8>> {
+    let pieces = prop::sample::select(vec![
+        "(1.5) can0 ",
+        "123#",
+        "0011",
+        "\n",
+        "#",
+        "R",
+        "_9",
+        "base hex\n",
+        "0.5 1 ",
+        "20x ",
+        "Rx ",
+        "d 2 ",
+        "00 ",
+        "date x\n",
+        "LOGG",
+        "LOBJ",
+        "\u{90}\0\0\0",
+        "\u{20}\0\u{1}\0",
+        "\u{30}\0\0\0",
+        "\u{1}\0\0\0",
+        "\u{a}\0\0\0",
+        "\0\0\0\0\0\0\0\0",
+        "-",
+        "99999999999999999999",
+    ]);
+    let text = prop::collection::vec(pieces, 0..40).prop_map(|pieces| {
+        let text = pieces.concat();
+        text.chars()
+            .map(|letter| u8::try_from(letter).unwrap_or(0))
+            .collect::<Vec<u8>>()
+    });
+    prop_oneof![text, prop::collection::vec(any::<u8>(), 0..300)]
+}
+
+proptest! {
+    #[test]
+    fn bits_are_those_of_the_definition(
+        data: [u8; 8],
+        big_endian: bool,
+        start in 0_u64..70,
+        size in 1_u64..=64,
+        length in 0_usize..=8,
+    ) {
+        let order = if big_endian { 0 } else { 1 };
+        let database = format!(
+            "VERSION \"\"\n\nBU_: A\n\nBO_ 16 M: 8 A\n SG_ S : {start}|{size}@{order}+ (1,0) [0|0] \"\" A\n"
+        );
+        let database = Database::parse("v.dbc", database.as_bytes()).unwrap();
+        let mut decoder = Decoder::new(&database, "log", None, true);
+        let mut kept = [0; 8];
+        kept[..length].copy_from_slice(&data[..length]);
+        decoder.frame(&Frame {
+            time_ns: 0, bus: "0", id: 16, extended: false, length, data: kept, place: Default::default(),
+        }).unwrap();
+        let (series, decoded) = decoder.finish();
+        let value = series[0].signals[0].values[0];
+        let mut short = [0; 8];
+        short.copy_from_slice(&kept);
+        let last_byte = |bit: u64| bit / 8 < length as u64;
+        let expected = raw_by_definition(&short, big_endian, start, size).filter(|_| {
+            // All its bytes were sent.
+            if big_endian { last_byte((start / 8) * 8 + (7 - start % 8) + size - 1) } else { last_byte(start + size - 1) }
+        });
+        match expected {
+            Some(raw) => prop_assert_eq!(value, raw as f64),
+            None => prop_assert!(value.is_nan()),
+        }
+        prop_assert_eq!(decoded.short, u64::from(expected.is_none()));
+    }
+
+    #[test]
+    fn no_bytes_make_a_reader_panic(bytes in any_log()) {
+        for reader in READERS {
+            if let Err(error) = read(reader, &bytes) {
+                let placed = error.place().line.is_some() || error.place().offset.is_some();
+                prop_assert!(placed || error.to_string().contains("no header"), "{}", error);
+            }
+        }
+    }
+
+    #[test]
+    fn no_database_makes_it_panic(text in "(VERSION \"\"|BU_: A|BO_ 1 M: 8 A| SG_ S m0M : 0|8@1[+]|[(]1,0[)] |[\\[]0|0\\] \"\" A|\n|SG_MUL_VAL_ 1 S S 0-0;|x|9){0,30}") {
+        let _ = Database::parse("v.dbc", text.as_bytes());
+    }
+
+    /// Rows hold each value once, at its time.
+    #[test]
+    fn merging_loses_and_invents_nothing(
+        steps in prop::collection::vec((0_u32..3, any::<bool>()), 1..60),
+    ) {
+        let mut log = String::new();
+        let mut now_ms = 0;
+        for (index, (step_ms, other)) in steps.iter().enumerate() {
+            now_ms += step_ms;
+            let id = if *other { "011" } else { "010" };
+            log.push_str(&format!("(1.{now_ms:03}) can0 {id}#{index:02X}00\n"));
+        }
+        let (read, _) = decode(&log).unwrap();
+        let mut found = Vec::new();
+        for (name, factor) in [("Shunt.Current_a", 1000.0), ("Other.Level_pct", 2.0)] {
+            for (time_s, value) in read.time_s().iter().zip(read.column(name).unwrap_or_default()) {
+                if !value.is_nan() {
+                    found.push(((value * factor).round() as usize, time_s.to_bits()));
+                }
+            }
+        }
+        found.sort_unstable();
+        let mut now_ms = 0;
+        let first_ms = steps[0].0;
+        let given: Vec<_> = steps.iter().enumerate().map(|(index, (step_ms, _))| {
+            now_ms += step_ms;
+            (index, (f64::from(now_ms - first_ms) / 1e3).to_bits())
+        }).collect();
+        prop_assert_eq!(found, given);
+        // No row without a value.
+        prop_assert!(read.len() <= steps.len());
+    }
+}

@@ -1,0 +1,134 @@
+//! Parquet, written and read.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::fs;
+
+use proptest::prelude::*;
+use recording::{Mapping, Table, convert, error::Kind, parquet};
+
+fn any_number() -> impl Strategy<Value = f64> {
+    any::<u64>().prop_map(|bits| {
+        let number = f64::from_bits(bits);
+        // One NaN stands for all: a missing value.
+        if number.is_finite() { number } else { f64::NAN }
+    })
+}
+
+fn bits(values: &[f64]) -> Vec<u64> {
+    values.iter().map(|value| value.to_bits()).collect()
+}
+
+fn table(rows: &[(f64, f64)]) -> Table {
+    let (first, second) = rows.iter().copied().unzip();
+    Table::new(
+        "x",
+        vec![("first".into(), first), ("i_ref_a".into(), second)],
+    )
+    .unwrap()
+}
+
+/// More rows than are written at once.
+#[test]
+fn several_groups_of_rows() {
+    let rows: Vec<_> = (0..300_000)
+        .map(|row| {
+            (
+                f64::from(row) * 1e-3,
+                if row % 3 == 0 {
+                    f64::NAN
+                } else {
+                    f64::from(row)
+                },
+            )
+        })
+        .collect();
+    let table = table(&rows)
+        .mapped(&Mapping::parse(["t_s=first"]).unwrap())
+        .unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("out.parquet");
+    let mut shares = Vec::new();
+    convert::write(&path, &table, &mut |share| shares.push(share)).unwrap();
+    assert!(
+        shares.is_sorted() && shares.iter().all(|share| (0.0..=1.0).contains(share)),
+        "{shares:?}"
+    );
+    let read = convert::recording(&path, &Mapping::new()).unwrap();
+    for name in ["t_s", "i_ref_a"] {
+        assert_eq!(
+            bits(read.need(name).unwrap()),
+            bits(table.need(name).unwrap()),
+            "{name}"
+        );
+    }
+}
+
+#[test]
+fn what_is_no_number_is_placed() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("out.parquet");
+    let error = parquet::write(
+        &path,
+        &table(&[(0.0, 1.0), (1.0, f64::INFINITY)]),
+        &mut |_| {},
+    )
+    .unwrap_err();
+    assert_eq!(error.kind(), Kind::Infinite);
+    assert!(
+        error
+            .to_string()
+            .contains("row 2, column 2 (i_ref_a): found an infinite value"),
+        "{error}"
+    );
+    assert_eq!(
+        fs::read_dir(folder.path()).unwrap().count(),
+        0,
+        "nothing is left"
+    );
+
+    let error = parquet::parse("r.parquet", b"PAR1 and no more".to_vec()).unwrap_err();
+    assert_eq!(error.kind(), Kind::Format);
+    assert!(
+        error.to_string().starts_with("r.parquet: found "),
+        "{error}"
+    );
+}
+
+proptest! {
+    #[test]
+    fn what_is_written_is_read_bit_by_bit(rows in prop::collection::vec((any_number(), any_number()), 1..50)) {
+        let table = table(&rows);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("out.parquet");
+        parquet::write(&path, &table, &mut |_| {}).unwrap();
+        let read = parquet::read(&path).unwrap();
+        prop_assert!(read.left_out.is_empty());
+        prop_assert!(table.names().eq(read.table.names()));
+        for ((_, ours), (_, theirs)) in table.columns().zip(read.table.columns()) {
+            prop_assert_eq!(bits(ours), bits(theirs));
+        }
+    }
+
+    #[test]
+    fn damage_makes_no_panic(
+        damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..6),
+        cut in prop::option::of(any::<prop::sample::Index>()),
+    ) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("out.parquet");
+        parquet::write(&path, &table(&[(0.0, 1.5), (1.0, f64::NAN), (2.0, -3.0)]), &mut |_| {}).unwrap();
+        let mut bytes = fs::read(&path).unwrap();
+        for (place, byte) in damage {
+            let place = place.index(bytes.len());
+            bytes[place] = byte;
+        }
+        if let Some(cut) = cut {
+            bytes.truncate(cut.index(bytes.len()));
+        }
+        match parquet::parse("r.parquet", bytes) {
+            Ok(read) => prop_assert!(read.table.columns().all(|(_, values)| values.len() == read.table.len())),
+            Err(error) => prop_assert!(error.to_string().starts_with("r.parquet")),
+        }
+    }
+}

@@ -1,0 +1,191 @@
+//! `twin convert` as it is called.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::{
+    fs,
+    path::Path,
+    process::{Command, Output},
+};
+
+const DATABASE: &str = r#"VERSION ""
+
+BU_: A
+
+BO_ 16 Shunt: 8 A
+ SG_ Current : 0|16@1- (1,0) [0|0] "mA" A
+ SG_ Volt : 16|16@1+ (0.001,0) [0|0] "V" A
+"#;
+
+const LOG: &str = "(1700000000.5) can0 010#E8030C0E\n\
+    (1700000000.6) can0 7FF#00\n\
+    (1700000000.75) can0 010#18FC\n\
+    (1700000001.5) can0 010#R\n";
+
+fn twin(folder: &Path, arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_twin"))
+        .args(arguments)
+        .current_dir(folder)
+        .output()
+        .unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8(bytes.to_vec()).unwrap()
+}
+
+fn folder() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("v.dbc"), DATABASE).unwrap();
+    fs::write(folder.path().join("drive.log"), LOG).unwrap();
+    folder
+}
+
+#[test]
+fn a_log_becomes_a_recording() {
+    let folder = folder();
+    let arguments = [
+        "convert",
+        "drive.log",
+        "--dbc",
+        "v.dbc",
+        "--out",
+        "drive.csv",
+    ];
+    let output = twin(folder.path(), &arguments);
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert_eq!(
+        text(&output.stdout),
+        "drive.csv: 2 rows of 3 columns from drive.log (candump log)\n\
+         2 frames decoded, 1 not in the DBC, 1 too short for a signal, 1 remote frames\n"
+    );
+    assert_eq!(text(&output.stderr), "");
+    assert_eq!(
+        fs::read_to_string(folder.path().join("drive.csv")).unwrap(),
+        "t_s,Shunt.Current_a,Shunt.Volt_v\n0,1,3.596\n0.25,-1,\n"
+    );
+}
+
+#[test]
+fn columns_are_mapped_and_parquet_holds_the_same() {
+    let folder = folder();
+    let mut arguments = vec!["convert", "drive.log", "--dbc", "v.dbc"];
+    arguments.extend(["--map", "i_ref_a=-Shunt.Current", "--out", "drive.parquet"]);
+    assert_eq!(twin(folder.path(), &arguments).status.code(), Some(0));
+    let output = twin(
+        folder.path(),
+        &["convert", "drive.parquet", "--out", "back.csv"],
+    );
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert_eq!(
+        fs::read_to_string(folder.path().join("back.csv")).unwrap(),
+        "t_s,i_ref_a,Shunt.Volt_v\n0,-1,3.596\n0.25,1,\n"
+    );
+}
+
+#[cfg(unix)]
+#[test]
+fn a_pipe_takes_the_recording_alone() {
+    let folder = folder();
+    let arguments = [
+        "convert",
+        "drive.log",
+        "--dbc",
+        "v.dbc",
+        "--out",
+        "/dev/stdout",
+    ];
+    let output = twin(folder.path(), &arguments);
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert!(text(&output.stdout).ends_with("\n0.25,-1,\n"));
+}
+
+#[test]
+fn bad_input_ends_with_2_and_leaves_nothing() {
+    let folder = folder();
+    let write = |name: &str, content: &str| fs::write(folder.path().join(name), content).unwrap();
+    write("bad.log", &format!("{LOG}(1700000002.5) can0 10#00\n"));
+    write("bad.dbc", "nonsense");
+    write("out.csv", "before");
+    let before = fs::read_dir(folder.path()).unwrap().count();
+    let cases: [(&[&str], &str); 8] = [
+        (&["no.log", "--dbc", "v.dbc"], "no.log: found no such file"),
+        (
+            &["drive.log"],
+            "drive.log: found CAN frames (candump log), expected a DBC",
+        ),
+        (
+            &["drive.log", "--dbc", "no.dbc"],
+            "no.dbc: found no such file",
+        ),
+        (
+            &["drive.log", "--dbc", "bad.dbc"],
+            "bad.dbc, line 1, column 1: found",
+        ),
+        (
+            &["bad.log", "--dbc", "v.dbc"],
+            "bad.log, line 5, column 3: found \"10#00\"",
+        ),
+        (
+            &["drive.log", "--dbc", "v.dbc", "--map", "x"],
+            "found \"x\", expected NAME=COLUMN",
+        ),
+        (
+            &["drive.log", "--dbc", "v.dbc", "--map", "x=Shunt.No"],
+            "drive.log: found the signals Shunt.Current_a, Shunt.Volt_v, expected a signal \"Shunt.No\"",
+        ),
+        (
+            &["drive.log", "--dbc", "v.dbc", "--bus", "can7"],
+            "drive.log: found no values, expected at least one signal that the database describes",
+        ),
+    ];
+    for (arguments, sentence) in cases {
+        let arguments = [&["convert", "--out", "out.csv"], arguments].concat();
+        let output = twin(folder.path(), &arguments);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}");
+        let told = text(&output.stderr);
+        assert!(
+            told.starts_with("error: ") && told.contains(sentence),
+            "{told}"
+        );
+        assert_eq!(told.lines().count(), 1, "{told}");
+        assert_eq!(text(&output.stdout), "");
+    }
+    for out in ["out.xls", "out", "no/such/folder.csv"] {
+        let output = twin(
+            folder.path(),
+            &["convert", "drive.log", "--dbc", "v.dbc", "--out", out],
+        );
+        assert_eq!(output.status.code(), Some(2), "{out}");
+        assert!(
+            text(&output.stderr).contains(out),
+            "{}",
+            text(&output.stderr)
+        );
+    }
+    assert_eq!(
+        fs::read_to_string(folder.path().join("out.csv")).unwrap(),
+        "before"
+    );
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), before);
+}
+
+#[test]
+fn help_has_an_example_and_wrong_arguments_end_with_2() {
+    let folder = folder();
+    let help = twin(folder.path(), &["convert", "--help"]);
+    assert_eq!(help.status.code(), Some(0));
+    assert!(text(&help.stdout).contains("Example:\n  twin convert "));
+    for arguments in [
+        &["convert"][..],
+        &["convert", "drive.log"],
+        &["no-such-command"],
+        &[],
+    ] {
+        assert_eq!(
+            twin(folder.path(), arguments).status.code(),
+            Some(2),
+            "{arguments:?}"
+        );
+    }
+}
