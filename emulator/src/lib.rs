@@ -6,6 +6,7 @@ pub mod can_bus;
 pub mod can_frame;
 pub mod cpu;
 pub mod drive;
+pub mod faults;
 pub mod i2c_bus;
 pub mod image;
 pub mod machine;

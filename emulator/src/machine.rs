@@ -286,6 +286,11 @@ impl<'table> Machine<'table> {
         &self.cpu
     }
 
+    /// The core, to be disturbed.
+    pub const fn cpu_mut(&mut self) -> &mut Cpu {
+        &mut self.cpu
+    }
+
     /// A word of the MCU's RAM, as a probe would read it; `None` outside.
     pub fn ram_word(&self, address: u32) -> Option<u32> {
         self.memories.word(address)
