@@ -539,7 +539,8 @@ impl Sink {
             new(true, view.signal("Current", "CurrentRange")),
             new(
                 environment,
-                view.signal("Environment", "SensorSupply").map(|mv| mv / 1e3),
+                view.signal("Environment", "SensorSupply")
+                    .map(|mv| mv / 1e3),
             ),
             new(environment, view.signal("Environment", "SensorTemperature")),
             sample.row.aux_current_a,

@@ -14,6 +14,7 @@ use recording::Mapping;
 use serde_json::json;
 
 use emulator::drive::{self, Drive, Figures};
+use emulator::faults;
 use emulator::profile::{self, Profile, ProfileOptions};
 use emulator::rig::{self, Firmware, Setup};
 use emulator::scenario::{Contactors, Key, Row, Scenario};
@@ -37,14 +38,18 @@ enum Command {
 
 const DRIVE_EXAMPLES: &str = "\
 Examples:
-  emulate drive --profile recordings/panasonic-18650pf/25c-us06.csv --scale 19 --duration 600 --out target/emulate
-  emulate drive --profile drive.csv --map i_ref_a=Shunt --map v_cell_v=Ucell --check
-  emulate drive --serve                    a parked car for python-can and a Modbus client
-  emulate drive --serve --profile drive.csv --scale 19
+  cargo xtask emulate --profile recordings/panasonic-18650pf/25c-us06.csv --scale 19 --duration 600
+  cargo xtask emulate --profile drive.csv --map i_ref_a=Shunt --map v_cell_v=Ucell --check
+  cargo xtask emulate --profile drive.csv --fault F9 --fault F21@7.5 --fault F14:open,large@10
+  cargo xtask emulate --serve                    a parked car for python-can and a Modbus client
+  cargo xtask emulate --serve --profile drive.csv --scale 19
 
 A profile needs t_s and i_ref_a (positive = discharge, at most ±600 A after scaling). temp_sensor_c, v_supply_v, i_aux_a,
 v_cell_v, v_pack_v, temp_cell_c and key (0 off, 1 accessory, 2 on) are used where they are.
---out gets can.log (candump -L), board.csv (the board beside the truth), rs485.log, defmt.log, summary.txt, summary.json.";
+--out gets can.log (candump -L), board.csv (the board beside the truth), rs485.log, defmt.log, summary.txt, summary.json;
+with `cargo xtask emulate` it is target/emulate, or nothing with --serve. docs/emulator.md tells more.
+
+Exit code 0: done; 1: --check found something, or the image did what the emulated board lacks; 2: bad input.";
 
 #[derive(Args, Debug)]
 struct DriveArguments {
@@ -52,7 +57,7 @@ struct DriveArguments {
     #[arg(long, value_name = "ELF")]
     image: Option<PathBuf>,
     /// The recorded drive
-    #[arg(long, value_name = "CSV", required_unless_present = "serve")]
+    #[arg(long, value_name = "CSV", required_unless_present_any = ["serve", "list_faults"])]
     profile: Option<PathBuf>,
     /// Calls a column of the profile by another name
     #[arg(long, value_name = "NAME=COLUMN", requires = "profile")]
@@ -75,6 +80,12 @@ struct DriveArguments {
     /// Seed of whatever is random: noise, bit errors, what a loss of power leaves
     #[arg(long, value_name = "NUMBER", default_value_t = 0)]
     seed: u64,
+    /// Puts a fault into the board, such as F9, F9:10kHz,30% or F9@2.5 (in s after power-on, else 2); may be given repeatedly
+    #[arg(long, value_name = "FAULT")]
+    fault: Vec<String>,
+    /// Lists the faults with their parameters, and ends
+    #[arg(long)]
+    list_faults: bool,
     /// Folder for what is written down; without it nothing is
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
@@ -172,6 +183,17 @@ fn main() -> ExitCode {
 
 /// Everything about the input is checked before a file is begun.
 fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
+    if arguments.list_faults {
+        for fault in faults::CATALOGUE {
+            println!("{:<5}{}: {}", fault.id, fault.title, fault.parameters);
+        }
+        return Ok(());
+    }
+    let injections = arguments
+        .fault
+        .iter()
+        .map(|text| faults::parse(text).map_err(|error| Failure::Input(error.to_string())))
+        .collect::<Result<Vec<_>, _>>()?;
     let path = arguments.image.clone().unwrap_or_else(rig::default_image);
     let firmware = Firmware::load(&path).map_err(|error| Failure::Input(format!("{error:#}")))?;
     let profile = arguments
@@ -188,6 +210,9 @@ fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
         .map_err(|error| Failure::Input(format!("listening for Ctrl-C: {error}")))?;
 
     let mut drive = Drive::new(&firmware, setup, arguments.out.as_deref())?;
+    for injection in &injections {
+        faults::apply(injection, &mut drive.rig);
+    }
     if arguments.serve {
         if arguments.profile.is_none() {
             // The clients are the other nodes.
@@ -279,6 +304,7 @@ fn report(arguments: &DriveArguments, figures: &Figures) -> serde_json::Result<S
             "lead_s": arguments.lead,
             "step_us": arguments.step,
             "seed": arguments.seed,
+            "faults": arguments.fault,
             "served": arguments.serve,
         },
         "figures": figures,

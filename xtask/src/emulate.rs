@@ -18,14 +18,14 @@ pub fn run(workspace: &Workspace, command: &str, arguments: &[String]) -> Result
     };
     let mut emulate = tool(workspace, "emulator", "emulate")?;
     emulate.arg(command);
-    let only_help = given("--help") || given("-h");
-    if !only_help && !given("--image") {
+    let only_words = ["--help", "-h", "--list-faults"].into_iter().any(given);
+    if !only_words && !given("--image") {
         let toolchain = toolchain::choose(workspace)?;
         emulate
             .arg("--image")
             .arg(image::build(workspace, &toolchain)?);
     }
-    if command == "drive" && !only_help && !given("--out") && !given("--serve") {
+    if command == "drive" && !only_words && !given("--out") && !given("--serve") {
         emulate
             .arg("--out")
             .arg(workspace.target_dir.join("emulate"));
