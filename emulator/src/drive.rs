@@ -12,6 +12,7 @@ use serde::Serialize;
 use core_logic::can::layout;
 use core_logic::error_budget::{ProfileSummary, charge_bound, no_load};
 use core_logic::units::{Duration, Microamps};
+use plant::violations::{Occurrences, Violations};
 use recording::csv::Writer;
 use recording::output::WholeFile;
 
@@ -98,6 +99,34 @@ pub struct Figures {
     pub diagnoses: Vec<Event>,
     /// Resets after the power-on, by cause.
     pub resets: Vec<Event>,
+    /// What the chips' data sheets forbid and the firmware did all the same.
+    pub violations: Vec<Breach>,
+}
+
+/// A rule of a chip's data sheet that was broken.
+#[derive(Clone, Debug, Serialize)]
+pub struct Breach {
+    /// The chip.
+    pub chip: String,
+    /// The rule, by its name in `plant`.
+    pub rule: String,
+    /// How often.
+    pub count: u64,
+    /// When last, in s.
+    pub last_s: f64,
+}
+
+fn breaches<K: std::fmt::Debug + Copy + Ord>(
+    chip: &str,
+    violations: &Violations<K>,
+) -> Vec<Breach> {
+    let breach = |(kind, times): (K, Occurrences)| Breach {
+        chip: chip.to_owned(),
+        rule: format!("{kind:?}"),
+        count: times.count,
+        last_s: times.last_s,
+    };
+    violations.iter().map(breach).collect()
 }
 
 /// Times that something took.
@@ -271,6 +300,14 @@ impl<'firmware> Drive<'firmware> {
             latency_of(|snapshot| snapshot.read),
         );
         let period = rig.view.period("Current");
+        let violations = rig.machine.board(|board| {
+            [
+                breaches("ADE7753", board.meter.violations()),
+                breaches("ADS1100", board.converter.violations()),
+                breaches("W25Q32", board.flash.violations()),
+            ]
+            .concat()
+        });
         Figures {
             length_s,
             took_s: started.elapsed().as_secs_f64(),
@@ -309,6 +346,7 @@ impl<'firmware> Drive<'firmware> {
                     at_s: reset.at.seconds(),
                 })
                 .collect(),
+            violations,
         }
     }
 
@@ -626,6 +664,13 @@ pub fn complaints(figures: &Figures) -> Vec<String> {
     complaints.extend(figures.diagnoses.iter().filter(unexpected).map(raised));
     let reset = |event: &Event| format!("reset by {} at {:.3} s", event.name, event.at_s);
     complaints.extend(figures.resets.iter().map(reset));
+    let breach = |breach: &Breach| {
+        format!(
+            "{}: {} against the data sheet, {} times, last at {:.3} s",
+            breach.chip, breach.rule, breach.count, breach.last_s
+        )
+    };
+    complaints.extend(figures.violations.iter().map(breach));
     complaints
 }
 
