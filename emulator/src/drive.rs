@@ -441,9 +441,34 @@ impl Flow {
     }
 }
 
+/// A folder that goes again if it was made here and nothing came into it.
+struct Folder {
+    path: PathBuf,
+    made: bool,
+}
+
+impl Folder {
+    fn make(path: &Path) -> Result<Self> {
+        let made = !path.exists();
+        std::fs::create_dir_all(path).map_err(|error| recording::Error::writing(path, &error))?;
+        Ok(Self {
+            path: path.to_owned(),
+            made,
+        })
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        if self.made {
+            // Refused where there are files in it.
+            let _ = std::fs::remove_dir(&self.path);
+        }
+    }
+}
+
 /// The files, written while it runs, named when it is done.
 struct Sink {
-    folder: PathBuf,
     can_log: BufWriter<WholeFile>,
     rs485_log: BufWriter<WholeFile>,
     defmt_log: BufWriter<WholeFile>,
@@ -453,6 +478,8 @@ struct Sink {
     samples: VecDeque<TruthSample>,
     /// Since the last row of the recording.
     news: News,
+    /// The last field: it is dropped when the unfinished files are gone.
+    folder: Folder,
 }
 
 /// What has been on the bus since the last row.
@@ -483,13 +510,11 @@ const COLUMNS: [&str; 11] = [
 impl Sink {
     fn create(folder: &Path) -> Result<Self> {
         let files = Outputs::in_folder(folder);
-        std::fs::create_dir_all(folder)
-            .map_err(|error| recording::Error::writing(folder, &error))?;
+        let folder = Folder::make(folder)?;
         let open = |path: &Path| -> Result<BufWriter<WholeFile>> {
             Ok(BufWriter::new(WholeFile::create(path)?))
         };
         Ok(Self {
-            folder: folder.to_owned(),
             can_log: open(&files.can_log)?,
             rs485_log: open(&files.rs485_log)?,
             defmt_log: open(&files.defmt_log)?,
@@ -497,6 +522,7 @@ impl Sink {
             view: BusView::default(),
             samples: VecDeque::new(),
             news: News::default(),
+            folder,
         })
     }
 
@@ -589,7 +615,7 @@ impl Sink {
     }
 
     fn finish(self, text: &str, json: &str) -> Result<()> {
-        let files = Outputs::in_folder(&self.folder);
+        let files = Outputs::in_folder(&self.folder.path);
         let mut finished = vec![];
         for file in [self.can_log, self.rs485_log, self.defmt_log] {
             finished.push(file.into_inner().map_err(|error| error.into_error())?);

@@ -6,7 +6,9 @@
 
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
+use std::thread;
+use std::time::Duration;
 
 use emulator::image::FLASH_START;
 use emulator::rig::default_image;
@@ -318,4 +320,35 @@ fn a_fault_shows_in_the_summary_and_in_the_exit_code() {
         "{}",
         text(&output.stdout)
     );
+}
+
+#[test]
+fn a_drive_that_does_not_end_leaves_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(
+        folder.path().join("long.csv"),
+        "t_s,i_ref_a\n0,20\n100000,20\n",
+    )
+    .unwrap();
+    let image = default_image();
+    let mut drive = Command::new(env!("CARGO_BIN_EXE_emulate"))
+        .current_dir(folder.path())
+        .args(["drive", "--profile", "long.csv", "--out", "out", "--image"])
+        .arg(&image)
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let out = folder.path().join("out");
+    while !out.exists() {
+        assert!(drive.try_wait().unwrap().is_none(), "it ended by itself");
+        thread::sleep(Duration::from_millis(10));
+    }
+    let interrupt = Command::new("kill")
+        .args(["-INT", &drive.id().to_string()])
+        .status()
+        .unwrap();
+    assert!(interrupt.success());
+    // What a shell makes of Ctrl-C.
+    assert_eq!(drive.wait().unwrap().code(), Some(130));
+    assert!(!out.exists());
 }
