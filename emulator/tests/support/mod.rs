@@ -138,6 +138,8 @@ pub struct CurrentFrame {
 /// The board on a bench.
 pub struct Bench<'firmware> {
     pub rig: Rig<'firmware>,
+    /// Requests that had to be repeated because no answer came.
+    pub repeats: u32,
     map: Map,
     decoder: BusView,
 }
@@ -155,6 +157,7 @@ impl<'firmware> Bench<'firmware> {
     pub fn powered(firmware: &'firmware Firmware, setup: Setup) -> Self {
         Self {
             rig: Rig::new(firmware, setup).unwrap(),
+            repeats: 0,
             map: Map::documented(),
             decoder: BusView::default(),
         }
@@ -247,7 +250,15 @@ impl<'firmware> Bench<'firmware> {
         let mut request = ModbusRequest::new(1, ModbusProto::Rtu);
         let mut frame = Vec::new();
         generate(&mut request, &mut frame)?;
-        let answer = self.exchange(&frame).unwrap();
+        let answer = match self.exchange(&frame) {
+            Ok(answer) => answer,
+            // As every client does.
+            Err(error) => {
+                self.repeats += 1;
+                println!("{:.3} s: {error:#}; repeated", self.now_s());
+                self.exchange(&frame).unwrap()
+            }
+        };
         request.parse_ok(&answer)?;
         let mut words = Vec::new();
         if matches!(frame[1], 3 | 4) {
@@ -262,7 +273,7 @@ impl<'firmware> Bench<'firmware> {
         let _ = self.rig.take_rs485();
         self.rig.send_rs485(frame);
         let mut answer = Vec::new();
-        for _ in 0..500 {
+        for _ in 0..200 {
             self.rig.run_s(0.001)?;
             answer.extend(self.rig.take_rs485());
             if answer.len() >= 5 {
@@ -278,7 +289,7 @@ impl<'firmware> Bench<'firmware> {
                 }
             }
         }
-        anyhow::bail!("no answer to {frame:02X?} within 0.5 s, but {answer:02X?}")
+        anyhow::bail!("no answer to {frame:02X?} within 0.2 s, but {answer:02X?}")
     }
 
     #[track_caller]
