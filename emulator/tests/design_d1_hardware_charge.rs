@@ -1,7 +1,7 @@
 //! D1 on the running image: the charge of a real drive, both signs and both ranges, as the energy meter counted it; over
 //! the wrap of its register, and over a reset of the microcontroller in the middle.
 //!
-//! The drive is 16 s of US06 on a Panasonic 18650PF (recordings/panasonic-18650pf, P. Kollmeyer, CC BY 4.0), multiplied
+//! The drive is 12 s of US06 on a Panasonic 18650PF (recordings/panasonic-18650pf, P. Kollmeyer, CC BY 4.0), multiplied
 //! by 19: 96 A of charge to 370 A of discharge.
 
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
@@ -18,7 +18,7 @@ use emulator::time::Ticks;
 use recording::Mapping;
 use support::{Account, Bench, Charge, firmware};
 
-const LENGTH_S: f64 = 16.0;
+const LENGTH_S: f64 = 12.0;
 
 /// The drive, at rest before and after it.
 fn drive() -> Vec<Row> {
