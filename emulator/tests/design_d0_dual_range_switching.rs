@@ -173,8 +173,8 @@ fn range_switches_at_53_33_a_in_both_directions_and_both_sides_are_right() {
         "{on_plateaus:?}"
     );
     assert!(
-        straddling >= 2,
-        "hardly more than one or two of four edges can fall on a conversion's end"
+        straddling >= 1,
+        "not all four edges can fall on a conversion's end"
     );
     assert!(
         (4..=8).contains(&range_changes),
