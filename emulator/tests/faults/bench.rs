@@ -158,17 +158,25 @@ pub fn is_latched(rig: &Rig<'_>, code: &str) -> bool {
     rig.view.latched_diagnoses().contains(&code)
 }
 
-/// Whether a diagnosis was ever on the bus.
+/// Diagnoses that were on the bus as active, or are kept as latched: what lasts for one tick is seen only there.
+fn raised(rig: &Rig<'_>) -> Vec<&'static str> {
+    let mut raised: Vec<&str> = rig.view.diagnoses.keys().copied().collect();
+    raised.extend(rig.view.latched_diagnoses());
+    raised.sort_unstable();
+    raised.dedup();
+    raised
+}
+
+/// Whether a diagnosis was ever raised.
 pub fn was_raised(rig: &Rig<'_>, code: &str) -> bool {
-    rig.view.diagnoses.contains_key(code)
+    raised(rig).contains(&code)
 }
 
 /// Diagnoses that were raised, but for `expected` and the one that a board without history cannot but raise.
 pub fn unexpected(rig: &Rig<'_>, expected: &[&str]) -> Vec<&'static str> {
-    let raised = rig.view.diagnoses.keys().copied();
+    let mut raised = raised(rig);
+    raised.retain(|code| *code != "SocUncertain" && !expected.contains(code));
     raised
-        .filter(|code| *code != "SocUncertain" && !expected.contains(code))
-        .collect()
 }
 
 /// Resets after the power-on.

@@ -21,6 +21,7 @@ fn fault_f11_the_i2c_bus_is_recovered_and_what_is_old_is_marked() {
         rig.run_s(0.5).unwrap();
         let recovered = counters(&mut rig, 0x0110, 2);
         board(&mut rig, |board| board.i2c_bus.take_log());
+        let struck_s = rig.now_s();
         strike(&mut rig, &format!("F11:{fault}"));
         let mut wrong = 0;
         let mut stale = 0;
@@ -37,10 +38,12 @@ fn fault_f11_the_i2c_bus_is_recovered_and_what_is_old_is_marked() {
         let good =
             |transfer: &Transaction| transfer.acknowledged && transfer.ending == Ending::Stop;
         // The driver leaves the bus alone for 25 ms while a conversion runs; what is beyond that is the fault's.
-        let starts: Vec<f64> = log
-            .iter()
-            .filter(|transfer| good(transfer))
-            .map(|transfer| transfer.start.seconds())
+        let starts: Vec<f64> = std::iter::once(struck_s)
+            .chain(
+                log.iter()
+                    .filter(|transfer| good(transfer))
+                    .map(|transfer| transfer.start.seconds()),
+            )
             .collect();
         let gap_s = starts
             .windows(2)

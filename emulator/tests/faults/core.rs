@@ -3,6 +3,8 @@
 use core_logic::range::Range;
 use emulator::faults::configurations_in_ram;
 use emulator::mcu::rcc::ResetCause;
+use emulator::rig::Setup;
+use emulator::scenario::{Contactors, Scenario};
 
 use crate::bench::*;
 
@@ -21,8 +23,7 @@ fn fault_f22_a_flipped_bit_of_the_configuration_is_found_and_defaults_take_over(
         let mut named_s = None;
         let start_s = rig.now_s();
         watch(&mut rig, 1.4, |rig| {
-            let active = rig.view.active_diagnoses();
-            if named_s.is_none() && active.contains(&"ConfigurationCorruptRam") {
+            if named_s.is_none() && was_raised(rig, "ConfigurationCorruptRam") {
                 named_s = Some(rig.now_s() - start_s);
             }
         });
@@ -44,7 +45,60 @@ fn fault_f22_a_flipped_bit_of_the_configuration_is_found_and_defaults_take_over(
 }
 
 #[test]
+fn fault_f23_the_wrap_of_the_microsecond_counter_is_not_seen() {
+    // The middle of its range, where a word beside it takes over, and its end. The counter is put there at rest: a jump of
+    // half an hour is a disturbance of its own.
+    for jumps in [&[1_u64 << 31][..], &[1 << 31, 1 << 32]] {
+        let start_s = 5.0;
+        let rows = vec![
+            row(0.0),
+            row(start_s),
+            row(start_s + 0.01).with_current(50.0),
+            row(start_s + 2.0).with_current(50.0),
+            row(start_s + 2.01),
+        ];
+        let mut rig = rig_of(Setup::nominal(
+            Scenario::new(rows, Contactors::AlwaysClosed).unwrap(),
+        ));
+        rig.run_s(SETTLED_S).unwrap();
+        if jumps.len() > 1 {
+            rig.machine
+                .timer(|timer| timer.preset((jumps[0] - 100_000) as u32));
+            rig.run_s(0.5).unwrap();
+        }
+        let wrap = jumps[jumps.len() - 1];
+        let wraps_in_s = start_s + 1.0 - rig.now_s();
+        let before_us = (wraps_in_s * 1e6) as u64;
+        rig.machine
+            .timer(|timer| timer.preset((wrap - before_us) as u32));
+        rig.run_s(start_s - 0.1 - rig.now_s()).unwrap();
+        rig.view.diagnoses.clear();
+        rig.view.restart_periods();
+        let known = unexpected(&rig, &[]);
+        let before = charges_c(&mut rig);
+        rig.run_s(start_s + 2.4 - rig.now_s()).unwrap();
+        let error_c = charge_error_c(&mut rig, before);
+        let period = rig.view.period("Current");
+        let uptime = counters(&mut rig, 0x000E, 1)[0];
+        println!(
+            "F23 {wrap} µs: charge error {:.1} mC of 100 C, frames {:.2} … {:.2} ms apart, uptime {uptime} s, {:?}",
+            error_c * 1e3,
+            period.shortest_s * 1e3,
+            period.longest_s * 1e3,
+            unexpected(&rig, &known)
+        );
+        assert!(error_c.abs() <= quantum_c(Range::Small), "{error_c}");
+        assert!(period.longest_s <= 0.0125 && period.shortest_s >= 0.0075);
+        assert_eq!(unexpected(&rig, &known), Vec::<&str>::new());
+        // It went on: 1.4 s and the request after the wrap.
+        assert_eq!(u64::from(uptime), (wrap + 1_420_000) / 1_000_000);
+        assert_eq!(resets(&rig), 0);
+    }
+}
+
+#[test]
 fn fault_f24_the_board_is_back_after_a_hang_or_fault_with_its_charge_and_the_cause() {
+    let mut beyond = Vec::new();
     for (fault, cause, diagnosis) in [
         ("hang", ResetCause::IndependentWatchdog, "WatchdogReset"),
         ("deadlock", ResetCause::IndependentWatchdog, "WatchdogReset"),
@@ -89,12 +143,15 @@ fn fault_f24_the_board_is_back_after_a_hang_or_fault_with_its_charge_and_the_cau
         assert!(back_s <= 0.35, "{fault}: {back_s}");
         assert!(named_s <= 2.0, "{fault}: {named_s}");
         assert_eq!(resets(&rig), 1, "{fault}");
-        assert!(error_c.abs() <= declared_c, "{fault}: {error_c}");
+        if error_c.abs() > declared_c {
+            beyond.push((fault, error_c, declared_c));
+        }
         // What flowed from the last word before the fault to the first reading after it, the meter's own count excepted.
-        let down_s = reset_s - struck_s + back_s + 0.1;
+        let down_s = reset_s - struck_s + back_s + 0.15;
         assert!(
             error_c.abs() <= 50.0 * down_s + quantum_c(Range::Small),
             "{fault}: {error_c}"
         );
     }
+    assert!(beyond.is_empty(), "beyond what is declared: {beyond:?}");
 }
