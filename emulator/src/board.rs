@@ -190,7 +190,7 @@ fn conditions(row: &Row, closed: bool) -> Conditions {
         sensor_supply_v: row.sensor_supply_v,
         converter_supply_v: row.converter_supply_v,
         aux_current_a: row.aux_current_a,
-        ..Conditions::default()
+        output_shift_v: row.output_shift_v,
     }
 }
 

@@ -16,7 +16,7 @@ use crate::board::{Board, LineFault};
 use crate::can_bus;
 use crate::can_frame::CanFrame;
 use crate::i2c_bus::I2cFault;
-use crate::image::{FLASH_START, SRAM_LENGTH, SRAM_START};
+use crate::image::{SRAM_LENGTH, SRAM_START};
 use crate::rig::{Rig, with_crc};
 use crate::rs485_line::{CharacterFault, Flood, Outgoing};
 use crate::time::Ticks;
@@ -263,7 +263,7 @@ pub enum Fault {
     },
     /// F16: a dominant short of 2.5 ms in the next frame of the board.
     CanShort,
-    /// F16: the bus is dominant.
+    /// F16: the bus is dominant from within the next frame of the board on: only a sender is driven to bus-off.
     CanDominant {
         /// How long.
         length: Ticks,
@@ -540,7 +540,7 @@ impl Fault {
             "F11" => {
                 let short = I2cFault::SdaLow(Some(given.length(0.1)));
                 let words = [
-                    ("sda", I2cFault::HoldSdaInByte { clocks: 9 }),
+                    ("sda", I2cFault::HoldSda { clocks: 9 }),
                     ("nack", I2cFault::NackAddresses(3)),
                     ("arbitration", I2cFault::LoseArbitration(1)),
                     ("glitch", I2cFault::Glitch),
@@ -549,7 +549,7 @@ impl Fault {
                 Self::I2c(
                     given
                         .word(&words)
-                        .unwrap_or(I2cFault::HoldSdaInByte { clocks: 9 }),
+                        .unwrap_or(I2cFault::HoldSda { clocks: 9 }),
                 )
             }
             "F12" => Self::ConverterReset,
@@ -765,7 +765,9 @@ impl Fault {
             Self::CanShort => rig
                 .machine
                 .can(|can| can.short_in_next_frame(now, Ticks::from_micros(2_500))),
-            Self::CanDominant { length } => rig.machine.can(|can| can.short(now, length)),
+            Self::CanDominant { length } => {
+                rig.machine.can(|can| can.short_in_next_frame(now, length));
+            }
             Self::CanAlone { length } => rig.machine.can(|can| {
                 can.set_fault(can_bus::Fault::NoOtherNode, true, now);
                 can.set_fault(can_bus::Fault::NoOtherNode, false, now + length);
@@ -806,7 +808,7 @@ impl Fault {
                 rig.send_rs485(&with_crc(&SAVE));
                 for (part, fault) in [
                     Self::ZeroWhileDriving,
-                    Self::I2c(I2cFault::HoldSdaInByte { clocks: 9 }),
+                    Self::I2c(I2cFault::HoldSda { clocks: 9 }),
                     Self::MeterBitFlips {
                         per_bit: 1e-3,
                         length: Some(Ticks(length.0 / 4)),
@@ -958,8 +960,10 @@ pub fn configurations_in_ram(rig: &Rig<'_>) -> Vec<u32> {
 
 /// Where nothing is on the chip's buses: the external memory's range, which this board has none in.
 const NOWHERE: u32 = 0x6000_0000;
-/// `b .`
-const ENDLESS_LOOP: [u8; 2] = [0xFE, 0xE7];
+/// `b .`, twice.
+const ENDLESS_LOOP: u32 = 0xE7FE_E7FE;
+/// RAM that no image of this size uses, for the endless loop: 2 KiB before the end.
+const UNUSED_RAM: u32 = SRAM_START + SRAM_LENGTH - 2_048;
 /// Less room than an exception frame takes (0x68 bytes with floating-point registers), above the end of the stack.
 const STACK_LEFT: u32 = 0x1000_0010;
 
@@ -978,12 +982,8 @@ fn stop_core(rig: &mut Rig<'_>, fault: CoreFault) {
     let mut registers = rig.machine.cpu().registers();
     match fault {
         CoreFault::Hang | CoreFault::Deadlock => {
-            let flash = &rig.firmware.image.flash;
-            let offset = (0..flash.len())
-                .step_by(2)
-                .find(|offset| flash[*offset..].starts_with(&ENDLESS_LOOP));
-            let offset = offset.and_then(|offset| u32::try_from(offset).ok());
-            registers.r[15] = offset.map_or(NOWHERE, |offset| FLASH_START + offset);
+            rig.machine.set_ram_word(UNUSED_RAM, ENDLESS_LOOP);
+            registers.r[15] = UNUSED_RAM;
         }
         CoreFault::Fault => registers.r[15] = NOWHERE,
         CoreFault::Stack => {

@@ -15,6 +15,7 @@ use crate::mcu::adc::Adc1;
 use crate::mcu::iwdg::Iwdg;
 use crate::mcu::rcc::{Rcc, ResetCause};
 use crate::mcu::system_bus::{Failure, SystemBus};
+use crate::mcu::tim2::Tim2;
 use crate::mcu::{Unmodelled, system_memory};
 use crate::outside::PORTS;
 use crate::rtt::{Log, Memory};
@@ -264,6 +265,11 @@ impl<'table> Machine<'table> {
     /// Works on the CAN bus.
     pub fn can<T>(&mut self, work: impl FnOnce(&mut CanBus) -> T) -> T {
         self.bus.with_can(work)
+    }
+
+    /// Works on TIM2, which gives the image its time in µs.
+    pub fn timer<T>(&mut self, work: impl FnOnce(&mut Tim2) -> T) -> T {
+        self.bus.with_timer(work)
     }
 
     /// Works on ADC1.

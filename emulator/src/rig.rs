@@ -98,8 +98,6 @@ type Action = Box<dyn FnOnce(&mut Rig<'_>)>;
 
 /// The running board with its observers.
 pub struct Rig<'firmware> {
-    /// What it runs.
-    pub firmware: &'firmware Firmware,
     /// The MCU.
     pub machine: Machine<'firmware>,
     /// What the CAN bus shows of the board.
@@ -139,7 +137,6 @@ impl<'firmware> Rig<'firmware> {
             _ => None,
         };
         Ok(Self {
-            firmware,
             machine: Machine::new(&firmware.image, log, board)?,
             view: BusView::default(),
             snapshots: Vec::new(),
