@@ -271,10 +271,7 @@ impl Center {
         let bus = self.bus.counters();
         let rows = [
             // During the self-test the chip answers; it just counts nothing that anybody may use.
-            (
-                Code::MeterNoAnswer,
-                !health.counting && !link.in_self_test,
-            ),
+            (Code::MeterNoAnswer, !health.counting && !link.in_self_test),
             (Code::MeterDeadBus, health.dead_bus),
             (Code::MeterChecksum, seen.checksum_bad),
             (Code::MeterReset, grown(&mut seen.resets, health.resets)),

@@ -93,6 +93,13 @@ mod app {
         ALIVE.fetch_or(1 << task as u32, Ordering::Relaxed);
     }
 
+    /// The next time at which the milliseconds since the start divided by [`TICK_MS`] leave `phase_ms`.
+    fn next_on_grid(phase_ms: u32) -> fugit::MonotonicTimerInstantU32<1_000> {
+        let now = Mono::now();
+        let into = now.duration_since_epoch().as_millis() % TICK_MS;
+        now + ((phase_ms + TICK_MS - into - 1) % TICK_MS + 1).millis()
+    }
+
     fn ask_meter(events: u32) {
         METER_EVENTS.fetch_or(events, Ordering::AcqRel);
         METER_WAKE.writer().write(());
@@ -104,6 +111,9 @@ mod app {
     /// Every task has to check in from here on, started or not.
     const START_LIMIT: Duration = Duration::from_ticks(1_000_000);
     const METER_POLL_MS: u32 = 20;
+    /// The meter's steps lie halfway between two ticks: its priority is the higher one, and setting the chip up takes
+    /// 0.6 ms, by which a frame would be late.
+    const METER_PHASE_MS: u32 = TICK_MS / 2;
     /// Ten seconds: a conversion adds a little noise to the energy.
     const TEMPERATURE_EVERY_POLLS: u32 = 500;
     /// The result is fetched this long before the next conversion, when even a slow one has ended.
@@ -316,18 +326,21 @@ mod app {
                 .channel()
                 .restore(charge, Nanocoulombs::ZERO, Nanocoulombs::ZERO);
         }
+        let mut next_poll = next_on_grid(METER_PHASE_MS);
         if meter.is_fresh() {
             cx.shared.meter_link.lock(|link| link.in_self_test = true);
+            Mono::delay_until(next_poll).await;
             if let Some(start) = meter.start_self_test() {
-                for _ in 0..meter::SELF_TEST_MS / 10 {
-                    Mono::delay(10.millis()).await;
+                for _ in 0..meter::SELF_TEST_MS / TICK_MS {
+                    next_poll += TICK_MS.millis();
+                    Mono::delay_until(next_poll).await;
                     alive(Task::Meter);
                 }
                 meter.finish_self_test(start);
             }
         }
         cx.shared.meter_link.lock(|link| link.in_self_test = false);
-        let mut next_poll = Mono::now();
+        Mono::delay_until(next_poll).await;
         let mut polls = 0_u32;
         let mut next_temperature = 0;
         let (mut edge, mut interrupt, mut verify, mut poll) = (false, false, true, true);
@@ -431,7 +444,7 @@ mod app {
                 (verify, poll) = (true, true);
                 next_poll += METER_POLL_MS.millis();
                 if Mono::now() >= next_poll {
-                    next_poll = Mono::now() + METER_POLL_MS.millis();
+                    next_poll = next_on_grid(METER_PHASE_MS);
                 }
             }
         }
@@ -453,7 +466,9 @@ mod app {
     }
 
     /// The converter's owner. Deadline one conversion, 31 ms: a miss costs a sample of the average; stale after three.
-    #[task(priority = 2, local = [converter], shared = [center, edges])]
+    ///
+    /// At the lowest priority, for it polls the bus for 0.1 ms at a time, and the CAN frames have no such time to spare.
+    #[task(priority = 1, local = [converter], shared = [center, edges])]
     async fn conversion(mut cx: conversion::Context) {
         let converter = cx.local.converter;
         loop {
@@ -523,10 +538,10 @@ mod app {
     /// Environment, diagnosis, permit and CAN, every 10 ms with at most 0.5 ms of jitter. A miss: a late frame.
     #[task(priority = 2, local = [analog, lines], shared = [center, edges, meter_link])]
     async fn tick(mut cx: tick::Context) {
-        let mut next = Mono::now();
+        let mut next = next_on_grid(0);
         loop {
-            next += TICK_MS.millis();
             Mono::delay_until(next).await;
+            next += TICK_MS.millis();
             alive(Task::Tick);
             time::extend();
             let now = time::now();
