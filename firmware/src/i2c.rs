@@ -165,9 +165,12 @@ impl Bus {
     }
 
     fn start(&self, address: SevenBitAddress, read: bool) -> Result<(), Error> {
+        // POS is cleared here and not at the end of a read: then STOP may still be set, and while it is CR1 must not be
+        // written (RM0090, I2C_CR1): read before the hardware clears it and written after, STOP would be asked for again.
         self.i2c.cr1().modify(|_, w| {
             w.start().set_bit();
-            w.ack().set_bit()
+            w.ack().set_bit();
+            w.pos().clear_bit()
         });
         self.wait(Error::Bus, |status| status & SB != 0)?;
         let byte = address << 1 | u8::from(read);
@@ -244,7 +247,6 @@ impl Bus {
             }
             *byte = self.i2c.dr().read().dr().bits();
         }
-        self.i2c.cr1().modify(|_, w| w.pos().clear_bit());
         Ok(())
     }
 
