@@ -24,7 +24,7 @@ use crate::design_parameters as design;
 use crate::diagnosis::{Changes, Code, CodeSet, Diagnosis, Effects};
 use crate::front_end::{Channel, FrontEnd, KeyFactors, PerRange, SupplyRelations};
 use crate::key_calibration::{
-    KeyCalibration, KeyInputs, KeyOutputs, KeyPhase, KeySample, KeyState,
+    KeyCalibration, KeyInputs, KeyOutputs, KeyPhase, KeyRefusal, KeySample, KeyState,
 };
 use crate::meter::{GapBridge, MeterConfig, MeterReport};
 use crate::modbus::readings::CommandState;
@@ -169,6 +169,23 @@ pub enum Refusal {
     SupplyCalibration = 13,
     /// The key is not OFF.
     KeyNotOff = 14,
+    /// Key line and CAN contradict each other.
+    KeyContradiction = 15,
+}
+
+impl From<KeyRefusal> for Refusal {
+    fn from(refusal: KeyRefusal) -> Self {
+        match refusal {
+            KeyRefusal::NoSamples | KeyRefusal::NoOffValue => Self::Timeout,
+            KeyRefusal::Unstable(_) => Self::Unstable,
+            KeyRefusal::CurrentFlows(_) => Self::CurrentFlows,
+            KeyRefusal::HighVoltageOn => Self::HighVoltage,
+            KeyRefusal::InvalidSample | KeyRefusal::WrongRange => Self::InvalidReading,
+            KeyRefusal::KeyContradiction => Self::KeyContradiction,
+            KeyRefusal::KOutOfLimits(_) | KeyRefusal::AOutOfLimits(_) => Self::BeyondLimit,
+            KeyRefusal::Cancelled => Self::Cancelled,
+        }
+    }
 }
 
 impl From<ZeroRefusal> for Refusal {
@@ -254,6 +271,8 @@ pub struct Measurement {
     effects: Effects,
     found: Option<Found>,
     order_outcome: (CommandState, u16),
+    /// The newest order is a key-state calibration, and it has not ended.
+    key_ordered: bool,
     restored_with_loss: bool,
     started: Instant,
     now: Instant,
@@ -439,6 +458,7 @@ impl Measurement {
             effects: Effects::default(),
             found: None,
             order_outcome: (CommandState::None, 0),
+            key_ordered: false,
             restored_with_loss,
             started: now,
             now,
@@ -616,6 +636,9 @@ impl Measurement {
             self.prepared = prepare(configuration, factors, self.prepared.supply);
             self.found = Some(Found::KeyFactors(factors));
         }
+        if self.key_ordered {
+            self.follow_key_order();
+        }
         if let Some(refusal) = self.zero.tick(&configuration.zero_drift, now) {
             self.fail(refusal.into());
         }
@@ -636,7 +659,10 @@ impl Measurement {
     /// Why it was not even begun.
     pub fn order(&mut self, configuration: &Configuration, order: Order) -> Result<(), Refusal> {
         let result = self.begin(configuration, order);
+        // The state is that of the newest order.
+        self.key_ordered = order == Order::KeyCalibration && result.is_ok();
         match result {
+            Ok(CommandState::Failed) => self.fail(Refusal::Cancelled),
             Ok(state) => self.order_outcome = (state, 0),
             Err(refusal) => self.fail(refusal),
         }
@@ -645,7 +671,20 @@ impl Measurement {
 
     /// Notes the outcome of a command that others carry out (save, restore, clear log).
     pub fn note_command(&mut self, state: CommandState, reason: u16) {
+        self.key_ordered = false;
         self.order_outcome = (state, reason);
+    }
+
+    /// An ordered key-state calibration ends with the key cycle that it waits for.
+    fn follow_key_order(&mut self) {
+        match self.key_outputs.phase {
+            KeyPhase::Off | KeyPhase::Taking => return,
+            KeyPhase::Taken => self.order_outcome = (CommandState::Done, 0),
+            KeyPhase::Failed(refusal) => self.fail(refusal.into()),
+            KeyPhase::Resumed => self.fail(Refusal::HighVoltage),
+            KeyPhase::Disabled => self.fail(Refusal::Disabled),
+        }
+        self.key_ordered = false;
     }
 
     fn begin(
@@ -700,7 +739,10 @@ impl Measurement {
                 Ok(CommandState::Done)
             }
             Order::Abort => {
-                let ended = self.zero.cancel().is_some() | self.sweep.take().is_some();
+                let ended = self.zero.cancel().is_some()
+                    | self.sweep.take().is_some()
+                    | self.key.cancel()
+                    | self.key_ordered;
                 Ok(if ended {
                     CommandState::Failed
                 } else {

@@ -497,8 +497,87 @@ fn a_zero_calibration_reports_progress_ends_and_can_be_aborted() {
     assert_eq!(bench.readings().command_reason, Refusal::Timeout as u16);
 }
 
+/// The command of a key-state calibration ends with the key cycle that it waits for.
 #[test]
-fn every_reason_against_a_zero_has_its_number() {
+fn an_ordered_key_calibration_ends_as_done_or_failed() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(1_500);
+    assert_eq!(bench.order(Order::KeyCalibration), Ok(()));
+    bench.run_ms(2_000);
+    let state = |bench: &Bench| {
+        let readings = bench.readings();
+        (readings.command_state, readings.command_reason)
+    };
+    assert_eq!(state(&bench), (CommandState::Running, 0));
+    bench.vehicle.acc_line = true;
+    bench.run_ms(300);
+    assert_eq!(state(&bench), (CommandState::Running, 0));
+    bench.run_ms(1_500);
+    assert_eq!(bench.readings().key_calibration_state, 2);
+    assert_eq!(state(&bench), (CommandState::Done, 0));
+
+    // A current flows until the delay has passed.
+    bench.vehicle.acc_line = false;
+    bench.run_ms(1_500);
+    assert_eq!(bench.order(Order::KeyCalibration), Ok(()));
+    bench.run_ms(1_500);
+    bench.report.mean_current = Microamps::from_amps(10);
+    bench.vehicle.acc_line = true;
+    bench.run_ms(2_000);
+    assert_eq!(bench.readings().key_calibration_state, 3);
+    assert_eq!(
+        state(&bench),
+        (CommandState::Failed, Refusal::CurrentFlows as u16)
+    );
+
+    // The state is that of the newest order: what an older one comes to does not change it.
+    bench.report.mean_current = Microamps::ZERO;
+    bench.vehicle.acc_line = false;
+    bench.run_ms(1_500);
+    assert_eq!(bench.order(Order::KeyCalibration), Ok(()));
+    bench.measurement.note_command(CommandState::Failed, 3);
+    bench.vehicle.acc_line = true;
+    bench.run_ms(2_000);
+    assert_eq!(state(&bench), (CommandState::Failed, 3));
+}
+
+#[test]
+fn abort_ends_a_key_calibration_too() {
+    let cancelled = (CommandState::Failed, Refusal::Cancelled as u16);
+    let mut bench = Bench::new(Configuration::default());
+    let state = |bench: &Bench| {
+        let readings = bench.readings();
+        (readings.command_state, readings.command_reason)
+    };
+    bench.run_ms(1_500);
+    // Ordered, and still waiting for the key.
+    assert_eq!(bench.order(Order::KeyCalibration), Ok(()));
+    assert_eq!(bench.order(Order::Abort), Ok(()));
+    assert_eq!(state(&bench), cancelled);
+    // While it takes ACC's output: the previous factors stay, and the permit does not wait any longer.
+    let before = bench.configuration.key_factors;
+    bench.code = 4_100;
+    bench.run_ms(1_500);
+    bench.code = 4_096;
+    bench.vehicle.acc_line = true;
+    bench.run_ms(300);
+    assert_eq!(bench.readings().activity, Activity::KeyCalibration);
+    assert!(!bench.tick.unwrap().hv_permit);
+    assert_eq!(bench.order(Order::Abort), Ok(()));
+    assert_eq!(state(&bench), cancelled);
+    bench.run_ms(2_000);
+    assert_eq!(bench.readings().activity, Activity::None);
+    assert_eq!(bench.configuration.key_factors, before);
+    assert!(bench.tick.unwrap().hv_permit);
+    assert!(bench.has(Code::KeyCalibrationFailed));
+    assert!(bench.measurement.current().validity.is_valid());
+    // Nothing is left to abort.
+    assert_eq!(bench.order(Order::Abort), Ok(()));
+    assert_eq!(state(&bench), (CommandState::Done, 0));
+}
+
+#[test]
+fn every_reason_against_a_calibration_has_its_number() {
     use core_logic::zero_drift::ZeroRefusal as Zero;
     let microamps = Microamps(1);
     for (zero, number) in [
@@ -519,6 +598,23 @@ fn every_reason_against_a_zero_has_its_number() {
         (Zero::Cancelled, 9),
     ] {
         assert_eq!(Refusal::from(zero) as u16, number);
+    }
+    use core_logic::key_calibration::KeyRefusal as Key;
+    let microvolts = Microvolts(1);
+    for (key, number) in [
+        (Key::HighVoltageOn, 2),
+        (Key::CurrentFlows(microamps), 3),
+        (Key::InvalidSample, 5),
+        (Key::WrongRange, 5),
+        (Key::Unstable(microvolts), 6),
+        (Key::KOutOfLimits(1), 7),
+        (Key::AOutOfLimits(microvolts), 7),
+        (Key::NoSamples, 8),
+        (Key::NoOffValue, 8),
+        (Key::Cancelled, 9),
+        (Key::KeyContradiction, 15),
+    ] {
+        assert_eq!(Refusal::from(key) as u16, number);
     }
 }
 
