@@ -16,7 +16,8 @@
 //!
 //! **Stuck.** A run of identical codes is legal at rest. It is implausible when it is at least
 //! [`ConverterConfig::stuck_count`] long and the energy meter's mean current has meanwhile moved by more than
-//! [`ConverterConfig::stuck_movement`]. Without a meter nothing is said.
+//! [`ConverterConfig::stuck_movement`]. Without a meter nothing is said, nor by a mean that reaches back to another
+//! supply or calibration: with these the meter's factors move, and a ratiometric sensor's codes rightly stay.
 
 use serde::{Deserialize, Serialize};
 
@@ -793,6 +794,14 @@ impl Converter {
         self.refused = Some((level, count));
         self.counters.steps_refused = self.counters.steps_refused.saturating_add(1);
         false
+    }
+
+    /// The meter counts by other factors from about `at` on: how its mean moves until then says nothing of the current.
+    pub fn forget_meter_until(&mut self, at: Instant) {
+        if let Some(run) = &mut self.run {
+            run.since = run.since.max(at);
+            run.meter = None;
+        }
     }
 
     /// The stuck rule of the module's description.

@@ -217,6 +217,11 @@ pub struct Tick {
 
 /// The supply is averaged over 2⁴ readings: one conversion of ADC1 is 1.6 mV of a 5 V supply.
 const SUPPLY_SHIFT: u32 = 4;
+/// A reading further than this from the mean is no noise: the mean begins anew there. Half a per cent, which the meter's
+/// scale would be wrong by for as long as the mean takes to follow; the converter's noise is a tenth of it.
+const SUPPLY_JUMP: Microvolts = Microvolts::from_millivolts(25);
+/// By then the meter counts with the factors that it is handed: a tick and a poll.
+const METER_FOLLOWS: Duration = Duration::from_ticks(50_000);
 /// Environment readings older than this are missing.
 const ENVIRONMENT_TIMEOUT: Duration = Duration::from_ticks(500_000);
 /// The first conversion is there by then: the chip's first result after power-up is discarded, and a conversion at
@@ -253,6 +258,8 @@ pub struct Measurement {
     compare: ChannelCompare,
     meter: MeterReport,
     meter_causes: Validity,
+    /// [`Measurement::meter_config`] is another one since it was taken.
+    meter_config_changed: bool,
     zero: ZeroCalibration,
     zero_beyond_limit: bool,
     sweep: Option<SupplyCalibration>,
@@ -432,6 +439,7 @@ impl Measurement {
             compare: ChannelCompare::new(),
             meter: MeterReport::default(),
             meter_causes: Validity::STALE,
+            meter_config_changed: true,
             zero: ZeroCalibration::new(),
             zero_beyond_limit: false,
             sweep: None,
@@ -473,11 +481,30 @@ impl Measurement {
     /// owner has to be handed [`Measurement::meter_config`] as well.
     pub fn configuration_changed(&mut self, configuration: &Configuration) {
         let before = self.prepared.soc;
-        self.prepared = prepare(configuration, self.key.factors(), self.prepared.supply);
+        let (factors, supply) = (self.key.factors(), self.prepared.supply);
+        self.prepare_again(configuration, factors, supply, self.now);
         if before.capacity() != self.prepared.soc.capacity() {
             self.soc.change_capacity(&before, &self.prepared.soc);
         }
         self.soc_reading = self.soc.reading(&self.prepared.soc);
+    }
+
+    /// What the meter's owner has to count with, if that has changed since the last call.
+    pub fn changed_meter_config(&mut self, configuration: &Configuration) -> Option<MeterConfig> {
+        core::mem::take(&mut self.meter_config_changed).then(|| self.meter_config(configuration))
+    }
+
+    fn prepare_again(
+        &mut self,
+        configuration: &Configuration,
+        factors: KeyFactors,
+        supply: Option<Microvolts>,
+        now: Instant,
+    ) {
+        self.prepared = prepare(configuration, factors, supply);
+        self.meter_config_changed = true;
+        self.converter
+            .forget_meter_until(now.checked_add_duration(METER_FOLLOWS).unwrap_or(now));
     }
 
     /// What the meter's owner has to count with.
@@ -526,7 +553,7 @@ impl Measurement {
     ) {
         self.environment = environment;
         self.environment_at = Some(now);
-        self.average_supply(configuration, environment.supply);
+        self.average_supply(configuration, environment.supply, now);
         let Some(network) = environment.network else {
             return;
         };
@@ -633,7 +660,7 @@ impl Measurement {
             },
         );
         if let Some(factors) = self.key_outputs.new_factors {
-            self.prepared = prepare(configuration, factors, self.prepared.supply);
+            self.prepare_again(configuration, factors, self.prepared.supply, now);
             self.found = Some(Found::KeyFactors(factors));
         }
         if self.key_ordered {
@@ -871,27 +898,28 @@ impl Measurement {
         {
             return;
         }
-        let own = self
-            .environment
-            .network
-            .filter(|_| !self.open_sensor.finding(Range::Small).is_fault())
-            .map(|volts| {
-                let hall = hall_voltage(volts);
-                let supply = self
-                    .prepared
-                    .supply
-                    .unwrap_or(design::SENSOR_NOMINAL_SUPPLY);
-                let rated = mul_div(
-                    i64::from(hall.get()),
-                    i64::from(design::SENSOR_NOMINAL_SUPPLY.get()),
-                    i64::from(supply.get()),
-                );
-                configuration.front_end.current(
-                    Microvolts(clamp_i32(rated)),
-                    Range::Small,
-                    design::SENSOR_NOMINAL_SUPPLY,
-                )
-            });
+        if self.open_sensor.finding(Range::Small).is_fault() {
+            // The large sensor is in use whatever the current, and rightly so.
+            self.flag = self.flag_plausibility.rest();
+            return;
+        }
+        let own = self.environment.network.map(|volts| {
+            let hall = hall_voltage(volts);
+            let supply = self
+                .prepared
+                .supply
+                .unwrap_or(design::SENSOR_NOMINAL_SUPPLY);
+            let rated = mul_div(
+                i64::from(hall.get()),
+                i64::from(design::SENSOR_NOMINAL_SUPPLY.get()),
+                i64::from(supply.get()),
+            );
+            configuration.front_end.current(
+                Microvolts(clamp_i32(rated)),
+                Range::Small,
+                design::SENSOR_NOMINAL_SUPPLY,
+            )
+        });
         self.flag = self.flag_plausibility.step(
             &configuration.flag,
             &FlagObservation {
@@ -904,15 +932,20 @@ impl Measurement {
         );
     }
 
-    /// A mean over some conversions of ADC1; a jump beyond half a volt is taken at once.
-    fn average_supply(&mut self, configuration: &Configuration, supply: Option<Microvolts>) {
+    /// A mean over some conversions of ADC1; a jump beyond [`SUPPLY_JUMP`] is taken at once.
+    fn average_supply(
+        &mut self,
+        configuration: &Configuration,
+        supply: Option<Microvolts>,
+        now: Instant,
+    ) {
         let mean = supply.map(|supply| {
-            let now = i64::from(supply.get());
+            let new = i64::from(supply.get());
             let sum = match self.supply_sum {
-                Some(sum) if ((sum >> SUPPLY_SHIFT) - now).abs() < 500_000 => {
-                    sum - (sum >> SUPPLY_SHIFT) + now
+                Some(sum) if ((sum >> SUPPLY_SHIFT) - new).abs() < i64::from(SUPPLY_JUMP.get()) => {
+                    sum - (sum >> SUPPLY_SHIFT) + new
                 }
-                _ => now << SUPPLY_SHIFT,
+                _ => new << SUPPLY_SHIFT,
             };
             self.supply_sum = Some(sum);
             Microvolts(clamp_i32(sum >> SUPPLY_SHIFT))
@@ -926,7 +959,7 @@ impl Measurement {
             (new, old) => new.is_some() != old.is_some(),
         };
         if moved {
-            self.prepared = prepare(configuration, self.key.factors(), mean);
+            self.prepare_again(configuration, self.key.factors(), mean, now);
         }
     }
 

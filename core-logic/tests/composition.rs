@@ -841,19 +841,82 @@ fn surroundings_are_sent_with_their_validity() {
     bench.run_ms(1_500);
     assert!(bench.has(Code::TemperatureOutOfRange));
     // A supply that jumps is believed at once, one that wanders is averaged.
-    bench.environment.supply = Some(Microvolts::from_millivolts(5_400));
+    bench.environment.supply = Some(Microvolts::from_millivolts(5_020));
     bench.run_ms(10);
-    assert!(bench.measurement.environment().supply < Millivolts(5_100));
+    assert!(bench.measurement.environment().supply < Millivolts(5_005));
     bench.run_ms(1_000);
     // Factors are worked out anew per millivolt.
     let supply = bench.measurement.environment().supply;
     assert!(
-        (Millivolts(5_399)..=Millivolts(5_400)).contains(&supply),
+        (Millivolts(5_019)..=Millivolts(5_020)).contains(&supply),
         "{supply:?}"
     );
     bench.environment.supply = Some(Microvolts::from_millivolts(4_600));
     bench.run_ms(10);
     assert_eq!(bench.measurement.environment().supply, Millivolts(4_600));
+}
+
+/// The meter's factors follow configuration and supply, and its mean with them; the codes rightly stay.
+#[test]
+fn a_mean_that_moves_by_other_factors_makes_no_converter_stuck() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(2_000);
+    bench
+        .configuration
+        .zero_drift
+        .value
+        .set(Range::Small, Microamps::from_amps(2));
+    bench
+        .measurement
+        .configuration_changed(&bench.configuration);
+    assert!(
+        bench
+            .measurement
+            .changed_meter_config(&bench.configuration)
+            .is_some()
+    );
+    assert_eq!(
+        bench.measurement.changed_meter_config(&bench.configuration),
+        None
+    );
+    // The meter has its new factors a poll later.
+    bench.run_ms(30);
+    bench.report.mean_current = Microamps::from_amps(-2);
+    bench.run_ms(1_500);
+    assert!(!bench.has(Code::ConverterStuck));
+    // Over the supply's range, which moves the meter's mean by 10 %.
+    for millivolts in (4_550..5_000).rev() {
+        bench.environment.supply = Some(Microvolts::from_millivolts(millivolts));
+        bench.report.mean_current = Microamps(-2_000_000 - (5_000 - millivolts) * 4_000);
+        bench.run_ms(10);
+        assert!(!bench.has(Code::ConverterStuck), "{millivolts} mV");
+    }
+    bench.run_ms(1_500);
+    assert!(!bench.has(Code::ConverterStuck));
+    // By nothing but itself it is the converter's fault.
+    bench.report.mean_current = Microamps::from_amps(2);
+    bench.run_ms(100);
+    assert!(bench.has(Code::ConverterStuck));
+}
+
+/// With the small sensor open the large one is right at any current: no contradiction to the flag.
+#[test]
+fn the_large_sensor_in_the_small_ones_place_is_no_implausible_flag() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(500);
+    bench.range = Range::Large;
+    bench.code = 4_096 + 123; // 20 A by the large sensor
+    bench.environment.network = Some(network_output_open());
+    bench.report.mean_current = Microamps::from_amps(20);
+    bench.run_ms(500);
+    assert!(bench.has(Code::SmallSensorOpen) && !bench.has(Code::FlagImplausible));
+    let sent = bench.measurement.current();
+    assert!(sent.validity.is_valid(), "{:?}", sent.validity);
+    assert!((sent.current.get() - 20_000_000).abs() < 200_000);
+    // The sensor is back, and the flag is not: now it contradicts.
+    bench.environment.network = Some(network_output(Microvolts(2_500_000 + 750_000)));
+    bench.run_ms(2_000);
+    assert!(bench.has(Code::FlagImplausible) && !bench.has(Code::SmallSensorOpen));
 }
 
 #[test]
