@@ -207,6 +207,8 @@ pub struct ChannelCompare {
     /// The meter's last count.
     moved: Option<Count>,
     gaps: u32,
+    /// Reports of an earlier time are not looked at.
+    not_before: Instant,
     report: CompareReport,
 }
 
@@ -232,6 +234,7 @@ impl ChannelCompare {
             pending: None,
             moved: None,
             gaps: 0,
+            not_before: Instant::from_ticks(0),
             report: CompareReport {
                 fast: Outcome::Undecided,
                 slow: Outcome::Undecided,
@@ -320,7 +323,7 @@ impl ChannelCompare {
             self.gaps = report.gaps;
             self.restart(report.lost);
         }
-        if report.lost {
+        if report.lost || at < self.not_before {
             return self.report;
         }
         let point = MeterPoint::new(at, report);
@@ -353,6 +356,12 @@ impl ChannelCompare {
             }
         }
         self.report
+    }
+
+    /// The factors are others, in the converter at once and in the meter by `at`: the comparison begins anew there.
+    pub fn restart_at(&mut self, at: Instant) {
+        self.not_before = at;
+        self.restart(false);
     }
 
     fn restart(&mut self, keep_frozen: bool) {
@@ -912,6 +921,21 @@ mod tests {
         assert!(bench.compare.pending.is_some());
         let report = bench.run(2_000, 20_000, 20_000);
         assert_eq!((report.fast, report.disagreements), (Outcome::Agree, 0));
+    }
+
+    /// The converter reads by the new factors at once, the meter 60 ms later.
+    #[test]
+    fn new_factors_are_not_compared_with_old_ones() {
+        let mut bench = Bench::new();
+        let _ = bench.run(2_400, 0, 0);
+        bench.compare.restart_at(at(bench.now + 60_000));
+        let _ = bench.run(60, 0, 3_000);
+        for _ in 0..30 {
+            let report = bench.run(100, 3_000, 3_000);
+            assert_eq!(report.disagreements, 0, "{report:?}");
+            assert!(!report.frozen);
+        }
+        assert_eq!(bench.compare.report().fast, Outcome::Agree);
     }
 
     #[test]

@@ -280,7 +280,8 @@ pub struct Measurement {
     order_outcome: (CommandState, u16),
     /// The newest order is a key-state calibration, and it has not ended.
     key_ordered: bool,
-    restored_with_loss: bool,
+    /// Charge that the reset may have cost.
+    loss: Nanocoulombs,
     started: Instant,
     now: Instant,
 }
@@ -402,6 +403,11 @@ fn prepare(
     }
 }
 
+/// When the meter counts by factors that change at `now`.
+fn meter_follows(now: Instant) -> Instant {
+    now.checked_add_duration(METER_FOLLOWS).unwrap_or(now)
+}
+
 impl Measurement {
     /// Starts, going on from `retained` where there is such a state. `loss` is the charge that the reset may have cost;
     /// zero after a clean restart.
@@ -418,8 +424,7 @@ impl Measurement {
             || Soc::new(&prepared.soc),
             |state| Soc::restore(&prepared.soc, &state.soc, state.charge_total),
         );
-        let restored_with_loss = loss != Nanocoulombs::ZERO;
-        if restored_with_loss {
+        if loss != Nanocoulombs::ZERO {
             soc.declare_loss(&prepared.soc, loss);
         }
         let mut measurement = Self {
@@ -467,7 +472,7 @@ impl Measurement {
             found: None,
             order_outcome: (CommandState::None, 0),
             key_ordered: false,
-            restored_with_loss,
+            loss,
             started: now,
             now,
         };
@@ -483,6 +488,7 @@ impl Measurement {
         let before = self.prepared.soc;
         let (factors, supply) = (self.key.factors(), self.prepared.supply);
         self.prepare_again(configuration, factors, supply, self.now);
+        self.compare.restart_at(meter_follows(self.now));
         if before.capacity() != self.prepared.soc.capacity() {
             self.soc.change_capacity(&before, &self.prepared.soc);
         }
@@ -503,8 +509,7 @@ impl Measurement {
     ) {
         self.prepared = prepare(configuration, factors, supply);
         self.meter_config_changed = true;
-        self.converter
-            .forget_meter_until(now.checked_add_duration(METER_FOLLOWS).unwrap_or(now));
+        self.converter.forget_meter_until(meter_follows(now));
     }
 
     /// What the meter's owner has to count with.
@@ -661,6 +666,7 @@ impl Measurement {
         );
         if let Some(factors) = self.key_outputs.new_factors {
             self.prepare_again(configuration, factors, self.prepared.supply, now);
+            self.compare.restart_at(meter_follows(now));
             self.found = Some(Found::KeyFactors(factors));
         }
         if self.key_ordered {
@@ -941,12 +947,14 @@ impl Measurement {
     ) {
         let mean = supply.map(|supply| {
             let new = i64::from(supply.get());
-            let sum = match self.supply_sum {
-                Some(sum) if ((sum >> SUPPLY_SHIFT) - new).abs() < i64::from(SUPPLY_JUMP.get()) => {
-                    sum - (sum >> SUPPLY_SHIFT) + new
-                }
-                _ => new << SUPPLY_SHIFT,
-            };
+            let follows = self
+                .supply_sum
+                .filter(|sum| ((sum >> SUPPLY_SHIFT) - new).abs() < i64::from(SUPPLY_JUMP.get()));
+            let sum = follows.map_or(new << SUPPLY_SHIFT, |sum| sum - (sum >> SUPPLY_SHIFT) + new);
+            if follows.is_none() {
+                // Converter and sensor are there before the meter's factors are.
+                self.compare.restart_at(meter_follows(now));
+            }
             self.supply_sum = Some(sum);
             Microvolts(clamp_i32(sum >> SUPPLY_SHIFT))
         });
@@ -1071,7 +1079,10 @@ impl Measurement {
             ),
             (Code::CellVoltageMissing, !self.vehicle.voltage_fresh),
             (Code::VehicleStateMissing, !self.vehicle.state_fresh),
-            (Code::ChargeRestoredWithLoss, self.restored_with_loss),
+            (
+                Code::ChargeRestoredWithLoss,
+                self.loss != Nanocoulombs::ZERO,
+            ),
         ];
         let mut set = CodeSet::EMPTY;
         for (code, present) in rows {
@@ -1088,6 +1099,11 @@ impl Measurement {
                 || self.key_outputs.phase == KeyPhase::Taking,
             Validity::CALIBRATING,
         )
+    }
+
+    /// The meter's own, and what the reset may have cost.
+    const fn charge_uncertainty(&self) -> Nanocoulombs {
+        self.meter.uncertainty.saturating_add(self.loss)
     }
 
     fn charge_validity(&self) -> Validity {
@@ -1149,7 +1165,7 @@ impl Measurement {
         can::Charge {
             charge: self.meter.charge_total,
             validity: self.charge_validity(),
-            estimated: self.restored_with_loss
+            estimated: self.loss != Nanocoulombs::ZERO
                 || self.meter.estimated_intervals > 0
                 || self.meter.gaps > 0,
         }
@@ -1164,7 +1180,7 @@ impl Measurement {
                 .charge_validity()
                 .and_if(self.meter.mean_over.is_zero(), Validity::STALE),
             below_no_load: self.meter.below_no_load,
-            charge_uncertainty: Some(self.meter.uncertainty),
+            charge_uncertainty: Some(self.charge_uncertainty()),
         }
     }
 
@@ -1321,7 +1337,7 @@ impl Measurement {
         readings.charge = self.meter.charge_total;
         readings.charge_in = self.meter.charge_in;
         readings.charge_out = self.meter.charge_out;
-        readings.charge_uncertainty = self.meter.uncertainty;
+        readings.charge_uncertainty = self.charge_uncertainty();
         readings.estimated_intervals = self.meter.estimated_intervals;
         if let Outcome::Disagree { difference, bound } = compared.slow {
             (readings.channel_difference, readings.channel_bound) = (difference, bound);

@@ -482,7 +482,8 @@ impl FlagPlausibility {
         let passed = passed_sensor(config, observation);
         let expected = expected_range(config, observation, passed);
         let contradiction = expected.is_some_and(|range| range != observation.flag)
-            || passed.is_some_and(|range| range != observation.flag);
+            || passed.is_some_and(|range| range != observation.flag)
+            || large_stays_behind(config, observation);
         self.report.expected = expected;
         self.report.passed = passed;
         if contradiction == self.report.implausible {
@@ -537,6 +538,18 @@ fn passed_sensor(config: &FlagPlausibilityConfig, seen: &FlagObservation) -> Opt
         (false, true) => Some(Range::Large),
         _ => None,
     }
+}
+
+/// The small sensor is beyond the switching current, and the large one, which is passed, reads less: an output that stands
+/// still near half its supply, or a way to the converter that does.
+fn large_stays_behind(config: &FlagPlausibilityConfig, seen: &FlagObservation) -> bool {
+    let above = config.switching_current.saturating_add(config.margin_above);
+    let below = config.switching_current.saturating_sub(config.margin_below);
+    seen.flag == Range::Large
+        && seen.passed_as_large.saturating_abs() < below
+        && seen
+            .small_sensor
+            .is_some_and(|own| own.saturating_abs() > above)
 }
 
 /// Which range the magnitude of the current calls for; `None` inside the comparators' hysteresis.
@@ -905,6 +918,10 @@ mod tests {
                 None
             );
         }
+        // A large sensor that stands at half its supply: 0 A, and the small one at its end.
+        assert!(verdict(Range::Large, 0.0, Some(60.0)).implausible);
+        assert!(verdict(Range::Large, 0.0, Some(-60.0)).implausible);
+        assert!(!verdict(Range::Large, 15.0, Some(60.0)).implausible);
         // Near 0 A the two lie within the tolerance.
         let zero = verdict(Range::Small, 0.5, Some(0.6));
         assert_eq!(zero.passed, None);

@@ -774,6 +774,11 @@ fn what_is_kept_over_a_reset_goes_on() {
     let lost = Nanocoulombs::from_milliamp_hours(i64::from(configuration.soc.capacity_mah) / 10);
     let mut lossy = Measurement::new(&configuration, Some(&kept), lost, start);
     assert!(lossy.charge().estimated);
+    assert_eq!(lossy.meter_current().charge_uncertainty, Some(lost));
+    assert_eq!(
+        clean.meter_current().charge_uncertainty,
+        Some(Nanocoulombs::ZERO)
+    );
     let grown =
         lossy.state_of_charge().uncertainty.unwrap().get() - before.uncertainty.unwrap().get();
     assert!((grown - 100_000).abs() < 10, "{grown}");
