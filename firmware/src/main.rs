@@ -46,7 +46,7 @@ mod app {
     use core_logic::{
         check_in::{CheckIn, Task},
         configuration::{Configuration, ConfigurationStore},
-        converter::ConverterSample,
+        converter::{ConverterSample, PollPace},
         diagnosis::Code,
         front_end::Channel,
         measurement::{ConverterFault, Order},
@@ -119,6 +119,8 @@ mod app {
     /// The result is fetched this long before the next conversion, when even a slow one has ended.
     const TEMPERATURE_AFTER_POLLS: u32 = 400;
     const TICK_MS: u32 = 10;
+    /// Idle looks for late tasks at most this often.
+    const IDLE_LOOK_US: u32 = 10_000;
     /// Time between two log records when nothing happens.
     const LOG_PERIOD_MS: u32 = 10_000;
     /// Stack that has to stay free.
@@ -263,7 +265,14 @@ mod app {
         for task in [Task::Storage, Task::Rs485] {
             check_in.enable(task, start);
         }
+        let mut looked = time::micros();
         loop {
+            // Every interrupt ends the sleep, a thousand of them a second; who is late is late by more than this.
+            if time::micros().wrapping_sub(looked) < IDLE_LOOK_US {
+                cortex_m::asm::wfi();
+                continue;
+            }
+            looked = time::micros();
             let now = time::now();
             if !all && elapsed(start, now) >= START_LIMIT {
                 all = true;
@@ -471,6 +480,7 @@ mod app {
     #[task(priority = 1, local = [converter], shared = [center, edges])]
     async fn conversion(mut cx: conversion::Context) {
         let converter = cx.local.converter;
+        let mut pace = PollPace::default();
         loop {
             alive(Task::Conversion);
             let (channel, config) = cx.shared.center.lock(|center| {
@@ -485,7 +495,7 @@ mod app {
             }
             let started = time::now();
             let outcome = match converter.start(&config) {
-                Ok(()) => finish(converter, &config).await,
+                Ok(()) => finish(converter, &config, &mut pace).await,
                 Err(fault) => Err(fault),
             };
             let finished = time::now();
@@ -517,20 +527,27 @@ mod app {
         }
     }
 
-    /// Polls the conversion under way from 0.8 to 1.5 of its nominal time.
+    /// Polls the conversion under way from shortly before its end to 1.5 of its nominal time.
     async fn finish(
         converter: &mut Converter,
         config: &core_logic::converter::ConverterConfig,
+        pace: &mut PollPace,
     ) -> Result<Option<i16>, ConverterFault> {
-        let period_ms = u32::try_from(config.data_rate.period().as_millis()).unwrap_or(125);
-        Mono::delay((period_ms * 4 / 5).millis()).await;
-        for _ in 0..period_ms * 7 / 10 + 2 {
-            match converter.poll(config)? {
-                Progress::Busy => Mono::delay(1.millis()).await,
-                Progress::Discarded => return Ok(None),
-                Progress::Ready(sample) => return Ok(Some(sample.code)),
-            }
+        let first_ms = pace.first_ms(config.data_rate);
+        Mono::delay(first_ms.millis()).await;
+        for waited_ms in first_ms..=PollPace::limit_ms(config.data_rate) {
+            let code = match converter.poll(config)? {
+                Progress::Busy => {
+                    Mono::delay(1.millis()).await;
+                    continue;
+                }
+                Progress::Discarded => None,
+                Progress::Ready(sample) => Some(sample.code),
+            };
+            pace.ended(waited_ms);
+            return Ok(code);
         }
+        pace.unknown();
         converter.on_timeout();
         Err(ConverterFault::NoAnswer)
     }
@@ -546,13 +563,14 @@ mod app {
             time::extend();
             let now = time::now();
             let history = cx.shared.edges.lock(|edges| edges.history(now));
-            let readings = cx.local.analog.read();
+            let readings = cx.local.analog.begin_tick();
             let levels = cx.local.lines.levels();
             let mut link = cx.shared.meter_link.lock(|link| *link);
             let permit = cx
                 .shared
                 .center
                 .lock(|center| center.tick(now, &history, levels, &readings, &mut link));
+            cx.local.analog.end_tick();
             cx.shared.meter_link.lock(|shared| {
                 shared.bridge = link.bridge;
                 shared.config = link.config;
@@ -660,28 +678,29 @@ mod app {
             if corrupt {
                 checked = now;
             }
-            let (active, changed, mut damaged) = cx.shared.administration.lock(|administration| {
-                let store = &mut administration.store;
-                let damaged = corrupt && store.verify().is_err();
-                if let Some(found) = found
-                    && let Ok(active) = store.stage()
-                {
-                    let mut staged = *active;
-                    found.store(&mut staged);
-                    if store.commit(staged).is_err() {
-                        defmt::warn!("calibration not taken: {}", found);
+            let (active, crc, changed, mut damaged) =
+                cx.shared.administration.lock(|administration| {
+                    let store = &mut administration.store;
+                    let damaged = corrupt && store.verify().is_err();
+                    if let Some(found) = found
+                        && let Ok(active) = store.stage()
+                    {
+                        let mut staged = *active;
+                        found.store(&mut staged);
+                        if store.commit(staged).is_err() {
+                            defmt::warn!("calibration not taken: {}", found);
+                        }
                     }
-                }
-                let changed = store.generation() != generation;
-                generation = store.generation();
-                (*store.active(), changed, damaged)
-            });
+                    let changed = store.generation() != generation;
+                    generation = store.generation();
+                    (*store.active(), store.crc(), changed, damaged)
+                });
             if changed {
                 apply(&mut cx, &active);
             } else if corrupt {
                 // What the measurement works with is a copy. Its CRC takes 0.5 ms, which the tick must not wait for.
                 let copy = cx.shared.center.lock(|center| center.configuration);
-                if copy.crc() != active.crc() {
+                if copy.crc() != crc {
                     apply(&mut cx, &active);
                     damaged = true;
                 }
