@@ -167,6 +167,8 @@ pub enum KeyRefusal {
     KOutOfLimits(i32),
     /// a would be this voltage.
     AOutOfLimits(Microvolts),
+    /// Ended by command.
+    Cancelled,
 }
 
 impl fmt::Display for KeyRefusal {
@@ -184,6 +186,7 @@ impl fmt::Display for KeyRefusal {
             Self::NoOffValue => write!(f, "no output was taken with key OFF"),
             Self::KOutOfLimits(ppm) => write!(f, "k is {ppm} ppm from one"),
             Self::AOutOfLimits(a) => write!(f, "a is {} µV", a.get()),
+            Self::Cancelled => write!(f, "ended by command"),
         }
     }
 }
@@ -323,6 +326,18 @@ impl KeyCalibration {
     #[must_use]
     pub const fn factors(&self) -> KeyFactors {
         self.factors
+    }
+
+    /// Ends the taking of VC2 of this key cycle; whether it was under way. What follows is what follows on any failure.
+    /// With key OFF nothing is under way: VC1 is but kept up to date.
+    pub fn cancel(&mut self) -> bool {
+        let under_way = self.phase == KeyPhase::Taking;
+        if under_way {
+            self.phase = KeyPhase::Failed(KeyRefusal::Cancelled);
+            self.refusal = Some(KeyRefusal::Cancelled);
+            self.batch = Batch::EMPTY;
+        }
+        under_way
     }
 
     /// Looks at lines, CAN and samples. To be called at least as often as samples arrive.

@@ -1,5 +1,6 @@
 //! The emulated board: the unmodified firmware image on an STM32F405, wired to the physical world of `plant`.
 
+pub mod bench;
 pub mod board;
 pub mod bus_view;
 pub mod can_bus;

@@ -34,6 +34,15 @@ enum Command {
     /// Drive the board and write down what it does
     #[command(after_help = DRIVE_EXAMPLES)]
     Drive(Box<DriveArguments>),
+    /// Measure the board's figures: latencies, periods, charge errors; exit code 1 if one is beyond its bound
+    Bench {
+        /// The image; without it the one that `cargo xtask build` made last
+        #[arg(long, value_name = "ELF")]
+        image: Option<PathBuf>,
+        /// Half a minute of the drive instead of an hour
+        #[arg(long)]
+        quick: bool,
+    },
 }
 
 const DRIVE_EXAMPLES: &str = "\
@@ -171,6 +180,7 @@ fn main() -> ExitCode {
     let CommandLine { command } = CommandLine::parse();
     let result = match command {
         Command::Drive(arguments) => drive(&arguments),
+        Command::Bench { image, quick } => bench(image, quick),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -179,6 +189,20 @@ fn main() -> ExitCode {
             failure.exit_code()
         }
     }
+}
+
+fn bench(image: Option<PathBuf>, quick: bool) -> Result<(), Failure> {
+    let path = image.unwrap_or_else(rig::default_image);
+    let firmware = Firmware::load(&path).map_err(|error| Failure::Input(format!("{error:#}")))?;
+    let figures = emulator::bench::run(&firmware, quick)?;
+    print!("{}", emulator::bench::Table(&figures));
+    let missed = figures.iter().filter(|figure| !figure.holds()).count();
+    if missed > 0 {
+        return Err(Failure::Check(format!(
+            "{missed} figures are beyond their bounds"
+        )));
+    }
+    Ok(())
 }
 
 /// Everything about the input is checked before a file is begun.

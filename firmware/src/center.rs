@@ -215,8 +215,10 @@ impl Center {
         }
         self.log_due |= !tick.changes.cleared.is_empty();
         self.send(now);
+        if let Some(config) = self.measurement.changed_meter_config(&self.configuration) {
+            link.config = config;
+        }
         if self.ticks.is_multiple_of(10) {
-            link.config = self.measurement.meter_config(&self.configuration);
             let (slot, bytes) = self.slots.write(&self.measurement.retained(0));
             retain::set_slot(slot, &bytes);
         }
@@ -270,7 +272,8 @@ impl Center {
         }
         let bus = self.bus.counters();
         let rows = [
-            (Code::MeterNoAnswer, !health.counting),
+            // During the self-test the chip answers; it just counts nothing that anybody may use.
+            (Code::MeterNoAnswer, !health.counting && !link.in_self_test),
             (Code::MeterDeadBus, health.dead_bus),
             (Code::MeterChecksum, seen.checksum_bad),
             (Code::MeterReset, grown(&mut seen.resets, health.resets)),

@@ -138,8 +138,14 @@ impl Meter {
 
     /// Whether the chip was just powered, so that a self-test costs no charge. A chip that still holds its
     /// configuration has counted through the reset of the microcontroller.
+    ///
+    /// A temperature conversion may still be waiting, for ever: see [`Meter::temperature`].
     pub fn is_fresh(&mut self) -> bool {
-        self.chip.read::<Mode>() != Ok(Config::DC.mode())
+        let mode = self.chip.read::<Mode>().map(|mode| Mode {
+            start_temperature: false,
+            ..mode
+        });
+        mode != Ok(Config::DC.mode())
     }
 
     /// Shorts channel 1 in the chip; to be ended by [`Meter::finish_self_test`] after [`SELF_TEST_MS`].
