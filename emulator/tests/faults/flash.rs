@@ -68,30 +68,38 @@ fn touched(rig: &mut Rig<'_>) -> u64 {
     })
 }
 
-/// The counts at which operations end, looked at every 100 µs for `length_s`.
-fn operations(rig: &mut Rig<'_>, length_s: f64) -> Vec<u64> {
+/// An operation: the counts at which it begins and ends, and whether it writes into the log.
+type Operation = (u64, u64, bool);
+
+/// The operations of `length_s`, looked at every 100 µs.
+fn operations(rig: &mut Rig<'_>, length_s: f64) -> Vec<Operation> {
+    let written = |rig: &mut Rig<'_>| {
+        board(rig, |board| {
+            let log = &board.flash.content()[0x20_0000..0x20_1000];
+            log.iter().filter(|byte| **byte != 0xFF).count()
+        })
+    };
     let start = touched(rig);
-    let mut ends = vec![0];
+    let (mut count, mut log) = (0, written(rig));
+    let mut operations = Vec::new();
     let end = rig.now_s() + length_s;
     while rig.now_s() < end {
         rig.run_s(1e-4).unwrap();
-        let count = touched(rig) - start;
-        if count != ends[ends.len() - 1] {
-            ends.push(count);
+        let (count_now, log_now) = (touched(rig) - start, written(rig));
+        if count_now != count {
+            operations.push((count, count_now, log_now != log));
         }
+        (count, log) = (count_now, log_now);
     }
-    ends
+    operations
 }
 
-/// Beginning, second byte, middle, last byte and end of each operation, and as many seeded random ones.
-fn samples(ends: &[u64], random: usize, seed: u64) -> Vec<u64> {
-    let last = ends[ends.len() - 1];
-    let mut samples: Vec<u64> = ends
-        .windows(2)
-        .flat_map(|pair| {
-            let (from, to) = (pair[0], pair[1]);
-            [from, from + 1, u64::midpoint(from, to), to - 1, to]
-        })
+/// First, second, middle and last byte and the end of each operation, and as many seeded random ones.
+fn samples(operations: &[Operation], random: usize, seed: u64) -> Vec<u64> {
+    let last = operations[operations.len() - 1].1;
+    let mut samples: Vec<u64> = operations
+        .iter()
+        .flat_map(|(from, to, _)| [*from, from + 1, u64::midpoint(*from, *to), to - 1, *to])
         .collect();
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     samples.extend((0..random).map(|_| rng.next_u64() % last));
@@ -155,7 +163,7 @@ fn fault_f19_a_save_cut_off_anywhere_leaves_the_old_or_the_new_configuration() {
         let ends = operations(&mut rig, 0.25);
         let samples = samples(&ends, random, 19);
         println!(
-            "F19 configuration, {what}: operations end at {ends:?}, {} samples",
+            "F19 configuration, {what}: operations {ends:?}, {} samples",
             samples.len()
         );
         for bytes in samples {
@@ -204,11 +212,13 @@ fn fault_f19_a_cut_off_state_costs_one_save_interval() {
     let mut rig = boot(flash.clone(), current_a);
     rig.run_s(0.5).unwrap();
     let ends = operations(&mut rig, 1.0);
-    let samples = samples(&ends[..ends.len().min(9)], 8, 20);
-    println!(
-        "F19 state: operations end at {ends:?}, {} samples",
-        samples.len()
-    );
+    // Two saves, and all of a log record.
+    let (log, saves): (Vec<Operation>, Vec<Operation>) =
+        ends.iter().partition(|operation| operation.2);
+    assert!(log.len() >= 2, "{ends:?}");
+    let chosen: Vec<Operation> = saves.iter().take(4).chain(&log).copied().collect();
+    let samples = samples(&chosen, 8, 20);
+    println!("F19 state: operations {ends:?}, {} samples", samples.len());
     let mut worst_c = 0.0_f64;
     let mut beyond = Vec::new();
     for bytes in &samples {
