@@ -841,6 +841,8 @@ mod app {
             }
             *administration.store.active()
         });
+        // Without a record the next start could not even say that something was lost.
+        let mut first_save = matches!(state, Stored::Nothing);
         let retained = retained_state(cx.local.previous, state);
         let (charge, meter_config) = cx.shared.center.lock(|center| {
             let (state, slots, loss) = &retained;
@@ -891,7 +893,10 @@ mod app {
                     center.configuration.save_policy,
                 )
             });
-            if policy.due(&save, now, state.charge_total) && storage.save_state(&state).await {
+            if (first_save || policy.due(&save, now, state.charge_total))
+                && storage.save_state(&state).await
+            {
+                first_save = false;
                 policy.saved(now, state.charge_total);
             }
             let due = cx
