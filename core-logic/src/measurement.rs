@@ -403,6 +403,20 @@ fn prepare(
     }
 }
 
+/// What the zero drift in force is at the sensor's output, rated supply: the key factors are taken of what it leaves, or
+/// the two would correct the same zero twice.
+fn zero_drift_voltage(configuration: &Configuration) -> Microvolts {
+    let output = |current: Microamps| {
+        configuration.front_end.voltage(
+            current,
+            KeyCalibration::RANGE,
+            design::SENSOR_NOMINAL_SUPPLY,
+        )
+    };
+    let drift = configuration.zero_drift.value.get(KeyCalibration::RANGE);
+    output(drift).saturating_sub(output(Microamps::ZERO))
+}
+
 /// When the meter counts by factors that change at `now`.
 fn meter_follows(now: Instant) -> Instant {
     now.checked_add_duration(METER_FOLLOWS).unwrap_or(now)
@@ -657,8 +671,17 @@ impl Measurement {
                 can_key: vehicle.can_key,
                 can_high_voltage: vehicle.can_high_voltage,
                 meter_current: self.meter_mean(),
+                meter_charge: self
+                    .meter
+                    .at
+                    .filter(|_| self.meter_causes.is_valid())
+                    .map(|at| (at, self.meter.charge_total)),
                 sample: (self.conversions > 0).then_some(KeySample {
-                    voltage: measured.then_some(self.reading.volts),
+                    voltage: measured.then(|| {
+                        self.reading
+                            .volts
+                            .saturating_sub(zero_drift_voltage(configuration))
+                    }),
                     range: self.reading.range,
                     at: self.reading.at,
                 }),

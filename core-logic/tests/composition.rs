@@ -541,6 +541,33 @@ fn an_ordered_key_calibration_ends_as_done_or_failed() {
     assert_eq!(state(&bench), (CommandState::Failed, 3));
 }
 
+/// Zero drift (D2) and key factors (D4) share the work: what the one has taken off, the other does not take off again.
+#[test]
+fn zero_drift_and_key_factors_together_read_0_a() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.code = 4_096 + 61; // 1 A at rest
+    bench.run_ms(1_500);
+    assert_eq!(bench.order(Order::ZeroNow), Ok(()));
+    bench.run_ms(3_000);
+    assert_eq!(bench.readings().command_state, CommandState::Done);
+    bench.vehicle.acc_line = true;
+    bench.code = 4_096 + 61 + 30; // 0.5 A more with the accessories on
+    bench.run_ms(2_000);
+    assert_eq!(bench.readings().key_calibration_state, 2);
+    let current = bench.measurement.current();
+    assert!(
+        current.current.saturating_abs() < Microamps(20_000),
+        "{current:?}"
+    );
+    // The next key cycle takes the same.
+    bench.vehicle.acc_line = false;
+    bench.code = 4_096 + 61;
+    bench.run_ms(2_000);
+    bench.vehicle.acc_line = true;
+    bench.run_ms(2_000);
+    assert!(bench.measurement.current().current.saturating_abs() < Microamps(20_000));
+}
+
 #[test]
 fn abort_ends_a_key_calibration_too() {
     let cancelled = (CommandState::Failed, Refusal::Cancelled as u16);

@@ -83,6 +83,7 @@ pub struct Center {
     ticks: u32,
     page: u8,
     stated: u32,
+    seconds: u32,
     shown: Option<Code>,
     meter_report_at: Option<Instant>,
     seen: Seen,
@@ -129,6 +130,7 @@ impl Center {
             ticks: 0,
             page: 0,
             stated: 0,
+            seconds: 0,
             shown: None,
             meter_report_at: None,
             seen: Seen::default(),
@@ -371,8 +373,14 @@ impl Center {
         let due = self.ticks.wrapping_sub(self.stated) >= SECOND;
         if due {
             self.stated = self.ticks;
+            self.seconds = self.seconds.wrapping_add(1);
         }
         due
+    }
+
+    /// How often [`Center::second_passed`] was true.
+    pub const fn seconds(&self) -> u32 {
+        self.seconds
     }
 
     /// Fills in what is known here.

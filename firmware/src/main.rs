@@ -841,6 +841,8 @@ mod app {
             }
             *administration.store.active()
         });
+        // Without a record the next start could not even say that something was lost.
+        let mut first_save = matches!(state, Stored::Nothing);
         let retained = retained_state(cx.local.previous, state);
         let (charge, meter_config) = cx.shared.center.lock(|center| {
             let (state, slots, loss) = &retained;
@@ -891,7 +893,10 @@ mod app {
                     center.configuration.save_policy,
                 )
             });
-            if policy.due(&save, now, state.charge_total) && storage.save_state(&state).await {
+            if (first_save || policy.due(&save, now, state.charge_total))
+                && storage.save_state(&state).await
+            {
+                first_save = false;
                 policy.saved(now, state.charge_total);
             }
             let due = cx
@@ -973,7 +978,7 @@ mod app {
         administration.lock(|administration| administration.busy = false);
     }
 
-    /// Once per turn of the storage task: its conditions; once a second the stack and the state.
+    /// Once per turn of the storage task: its conditions; once a second the state, and at times the stack.
     fn supervise(
         storage: &mut Storage,
         center: &mut impl rtic::Mutex<T = Center>,
@@ -998,12 +1003,21 @@ mod app {
         if !due {
             return;
         }
-        let used = stack::high_water_bytes();
-        let (current, charge) = center.lock(|center| {
-            let free = stack::BYTES.saturating_sub(used);
-            center.conditions.little_stack = free < STACK_RESERVE;
-            center.identity.stack_free = u32::try_from(free).unwrap_or(0);
-            (center.measurement.current(), center.measurement.charge())
+        // It reads up to 64 KiB, which takes a millisecond: every eighth second, the first one included.
+        let look = center.lock(|center| center.seconds() % 8 == 1);
+        let used = look.then(stack::high_water_bytes);
+        let (current, charge, used) = center.lock(|center| {
+            if let Some(used) = used {
+                let free = stack::BYTES.saturating_sub(used);
+                center.conditions.little_stack = free < STACK_RESERVE;
+                center.identity.stack_free = u32::try_from(free).unwrap_or(0);
+            }
+            let used = stack::BYTES.saturating_sub(center.identity.stack_free as usize);
+            (
+                center.measurement.current(),
+                center.measurement.charge(),
+                used,
+            )
         });
         defmt::info!(
             "{} {}, {} {}, stack {}",
