@@ -842,7 +842,7 @@ mod app {
             *administration.store.active()
         });
         // Without a record the next start could not even say that something was lost.
-        let mut first_save = matches!(state, Stored::Nothing);
+        let mut first_save = !matches!(state, Stored::Value(_));
         let retained = retained_state(cx.local.previous, state);
         let (charge, meter_config) = cx.shared.center.lock(|center| {
             let (state, slots, loss) = &retained;

@@ -270,8 +270,8 @@ fn fault_f20_a_damaged_record_is_never_used() {
     let end = (0..0x4000).rev().find(|at| two[*at] != 0xFF).unwrap();
     println!("F20: second record from {second:#X} to {end:#X}");
 
-    // The only record, at its beginning, in the middle and at its end: the factory's configuration. Of two the newer one: the
-    // older one serves, as after a save that was cut off. That nothing is said of either is a miss: docs/faults.md.
+    // The only record, at its beginning, in the middle and at its end: the factory's configuration, and it is said. Of two the
+    // newer one: the older one serves, as after a save that was cut off. That nothing is said of it is a miss: docs/faults.md.
     for (what, flash, at) in [
         ("only", &one, 12),
         ("only", &one, second / 2),
@@ -290,6 +290,10 @@ fn fault_f20_a_damaged_record_is_never_used() {
         assert!(rig.view.current_a().valid().is_some());
         let expected = if what == "only" { 240_000 } else { 100_000 };
         assert_eq!(capacity, expected, "{what} record, {at:#X}");
+        if what == "only" {
+            assert!(was_raised(&rig, "ConfigurationDefault"), "{at:#X}");
+            assert!(was_raised(&rig, "FlashFault"), "{at:#X}");
+        }
     }
 
     // A flash that is not there.
@@ -298,13 +302,15 @@ fn fault_f20_a_damaged_record_is_never_used() {
     rig.run_s(1.5).unwrap();
     println!("F20 no flash: {:?}", unexpected(&rig, &[]));
     assert!(rig.view.current_a().valid().is_some());
-    assert!(was_raised(&rig, "ConfigurationDefault") || was_raised(&rig, "FlashFault"));
+    assert!(was_raised(&rig, "ConfigurationDefault"));
+    assert!(was_raised(&rig, "FlashFault"));
 
     // Worn sectors of the state: what is written reads otherwise. The board measures on, and the next start takes none of it.
     let mut rig = boot(one, 550.0);
     strike(&mut rig, "F20");
     rig.run_s(3.0).unwrap();
     let counted_c = charge_c(&rig);
+    assert!(was_raised(&rig, "FlashFault"));
     rig.power_cycle();
     rig.view = Default::default();
     started(&mut rig);
