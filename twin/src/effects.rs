@@ -1,0 +1,1 @@
+//! The library of physics that a simulation can leave out.
