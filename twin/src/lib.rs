@@ -7,3 +7,4 @@ pub mod failure;
 pub mod problem;
 pub mod progress;
 pub mod report;
+pub mod spectrum;
