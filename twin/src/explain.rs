@@ -217,7 +217,9 @@ fn one(
         });
     }
     report.models.push(fitted(problem, &selection.fit));
-    report.plots.push(plots(&bench, &selection.fit, &held_residual));
+    report
+        .plots
+        .push(plots(&bench, &selection.fit, &held_residual));
     let sentence = sentence(&bench, &selection, verdict, left, report);
     Part {
         verdict,
