@@ -23,7 +23,16 @@ pub fn significant(value: f64, digits: usize) -> String {
     minus(format!("{value:.decimals$}"))
 }
 
-/// A value and the ends of its interval, all to the place that the interval resolves with two digits.
+/// `value` with at most `digits` significant digits: a limit of 3 is not 3.000.
+pub fn at_most(value: f64, digits: usize) -> String {
+    let number = significant(value, digits);
+    let (mantissa, exponent) = number.split_once('e').map_or((number.as_str(), None), |(m, e)| (m, Some(e)));
+    let mantissa = if mantissa.contains('.') { mantissa.trim_end_matches('0').trim_end_matches('.') } else { mantissa };
+    exponent.map_or_else(|| mantissa.to_owned(), |exponent| format!("{mantissa}e{exponent}"))
+}
+
+/// A value and the ends of its interval, all to the place that half the interval resolves: with two digits below 3, else
+/// with one.
 pub fn with_interval(value: f64, interval: [f64; 2]) -> [String; 3] {
     let [low, high] = interval;
     let half = (high - low) / 2.0;
@@ -31,7 +40,8 @@ pub fn with_interval(value: f64, interval: [f64; 2]) -> [String; 3] {
         return [value, low, high].map(|number| significant(number, 4));
     }
     let size = value.abs().max(low.abs()).max(high.abs());
-    let place = exponent_of(&format!("{half:.1e}")) - 1;
+    let half = format!("{half:.1e}");
+    let place = exponent_of(&half) - i32::from(half.starts_with(['1', '2']));
     let exponent = exponent_of(&format!("{size:.1e}"));
     if !(-4..6).contains(&exponent) {
         let digits = (exponent - place).max(0) as usize;
@@ -100,12 +110,12 @@ pub fn place(location: &Location) -> String {
         (LocationKind::Frequency, "frequency_hz" | "") => "frequency",
         (_, variable) => variable,
     };
-    let end = |value: f64| quantity(&significant(value, 4), &location.unit);
+    let end = |value: f64| quantity(&at_most(value, 4), &location.unit);
     let from = location.from.filter(|value| value.is_finite());
     let to = location.to.filter(|value| value.is_finite());
     match (from, to) {
         (Some(from), Some(to)) if from == to => format!("{variable} = {}", end(from)),
-        (Some(from), Some(to)) => format!("{variable} {} … {}", significant(from, 4), end(to)),
+        (Some(from), Some(to)) => format!("{variable} {} … {}", at_most(from, 4), end(to)),
         (Some(from), None) => format!("{variable} > {}", end(from)),
         (None, Some(to)) => format!("{variable} < {}", end(to)),
         (None, None) => format!("{variable}: everywhere"),
@@ -202,9 +212,10 @@ mod tests {
 
     #[test]
     fn an_interval_decides_the_digits() {
-        assert_eq!(with_interval(0.501_9, [0.497_1, 0.507_2]), ["0.5019", "0.4971", "0.5072"]);
+        assert_eq!(with_interval(0.501_9, [0.497_1, 0.507_2]), ["0.502", "0.497", "0.507"]);
+        assert_eq!(with_interval(0.484_8, [0.472_8, 0.498]), ["0.485", "0.473", "0.498"]);
         assert_eq!(with_interval(1_203.7, [1_100.2, 1_310.9]), ["1204", "1100", "1311"]);
-        assert_eq!(with_interval(-0.004, [-0.013, 0.005]), ["−0.0040", "−0.0130", "0.0050"]);
+        assert_eq!(with_interval(-0.004, [-0.013, 0.005]), ["−0.004", "−0.013", "0.005"]);
         assert_eq!(with_interval(3.21e-7, [3.0e-7, 3.4e-7]), ["3.21e-7", "3.00e-7", "3.40e-7"]);
         assert_eq!(with_interval(2.0, [f64::NEG_INFINITY, 5.0]), ["2.000", NONE, "5.000"]);
     }
@@ -222,5 +233,9 @@ mod tests {
         assert_eq!(p_value(0.012), "p = 0.012");
         assert_eq!(grouped(36_000), "36,000");
         assert_eq!(grouped(999), "999");
+        assert_eq!(at_most(3.0, 4), "3");
+        assert_eq!(at_most(53.33, 4), "53.33");
+        assert_eq!(at_most(1_200.0, 2), "1200");
+        assert_eq!(at_most(2e-7, 3), "2e-7");
     }
 }

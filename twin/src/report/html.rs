@@ -115,6 +115,18 @@ fn answer(page: &mut String, report: &Report) {
     ));
     let summary = if report.summary.trim().is_empty() { meaning(report.verdict) } else { report.summary.trim() };
     page.push_str(&format!("<p class=\"summary\">{}</p>\n", escape(summary)));
+    page.push_str("<dl class=\"stats\">");
+    for signal in &report.signals {
+        let improved = change(signal.held_out_blocks_before, signal.held_out_blocks_after);
+        page.push_str(&format!(
+            "<div><dt>Held-out error of <code>{}</code></dt><dd>{}<strong>{}</strong>{}</dd></div>",
+            escape(&signal.name),
+            if report.effects.is_empty() { String::new() } else { format!("{} → ", significant(signal.held_out_blocks_before, 3)) },
+            escape(&quantity(&significant(signal.held_out_blocks_after, 3), &signal.unit)),
+            if report.effects.is_empty() || improved.is_empty() { String::new() } else { format!(" <span class=\"change\">{improved}</span>") },
+        ));
+    }
+    page.push_str("</dl>\n");
     if report.effects.is_empty() {
         page.push_str("</section>\n");
         return;
@@ -170,7 +182,7 @@ fn places(page: &mut String, report: &Report) {
         let density = location.energy_share / location.sample_share;
         page.push_str(&format!(
             "<tr><th scope=\"row\">{}</th><td data-label=\"Signal\"><code>{}</code></td><td data-label=\"Energy\">{}</td><td data-label=\"Samples\">{}</td>\
-             <td class=\"n\" data-label=\"Density\">{}</td><td class=\"p\" data-label=\"p\">{}</td><td data-label=\"Accounted for by\">{}</td></tr>\n",
+             <td class=\"n\" data-label=\"Density\">{}</td><td class=\"p\" data-label=\"p\">{}</td><td data-label=\"Effect\">{}</td></tr>\n",
             escape(&place(location)),
             escape(&location.signal),
             bar(location.energy_share, "energy"),
@@ -258,17 +270,21 @@ fn one_effect(page: &mut String, effect: &EffectReport) {
 
 /// The gain on samples that were not fitted, against what the best of the placebos reaches.
 fn evidence(page: &mut String, effect: &EffectReport) {
-    let width = |share: f64| if share.is_finite() { 100.0 * share.clamp(0.0, 1.0) } else { 0.0 };
     let ratio = effect.held_out_gain / effect.placebo_p99;
+    page.push_str("<h4>Evidence</h4>\n<div class=\"bars\" aria-hidden=\"true\">");
+    for (what, class, share) in [("this effect", "gain", effect.held_out_gain), ("placebos", "samples", effect.placebo_p99)] {
+        let width = if share.is_finite() { 100.0 * share.clamp(0.0, 1.0) } else { 0.0 };
+        page.push_str(&format!(
+            "<span>{what}</span><span class=\"track tall\"><span class=\"fill {class}\" style=\"width:{width:.2}%\"></span></span><span class=\"n\">{}</span>",
+            percent(share)
+        ));
+    }
     page.push_str(&format!(
-        "<h4>Evidence</h4>\n<div class=\"evidence\"><div class=\"track tall\" aria-hidden=\"true\"><span class=\"fill gain\" style=\"width:{:.2}%\"></span>\
-         <span class=\"placebo\" style=\"width:{:.2}%\"></span></div>\n<p>It removes <strong>{}</strong> of the squared error that is left without it, on samples \
-         that were not fitted. Of inputs that cannot be the cause (placebos), 99 % remove at most <strong>{}</strong>{}.</p></div>\n",
-        width(effect.held_out_gain),
-        width(effect.placebo_p99),
+        "</div>\n<p>It removes <strong>{}</strong> of the squared error that is left without it, on samples that were not fitted. \
+         Of inputs that cannot be the cause (placebos), 99 % remove at most <strong>{}</strong>{}.</p>\n",
         percent(effect.held_out_gain),
         percent(effect.placebo_p99),
-        if ratio.is_finite() && ratio > 0.0 { format!(": {} times as much", significant(ratio, 2)) } else { String::new() },
+        if ratio.is_finite() && ratio > 1.0 { format!("; the effect removes {} times as much", significant(ratio, 2)) } else { String::new() },
     ));
 }
 
@@ -358,7 +374,7 @@ fn error_bars(page: &mut String, signal: &SignalReport) {
         return;
     }
     let width = |value: f64| if value.is_finite() { 100.0 * (value / largest).clamp(0.0, 1.0) } else { 0.0 };
-    page.push_str("<div class=\"errors\" aria-hidden=\"true\">");
+    page.push_str("<div class=\"bars\" aria-hidden=\"true\">");
     for (what, value) in [("before", signal.held_out_blocks_before), ("after", signal.held_out_blocks_after)] {
         page.push_str(&format!(
             "<span>{what}</span><span class=\"track tall\"><span class=\"fill {what}\" style=\"width:{:.2}%\"></span><span class=\"floor\" style=\"left:{:.2}%\"></span></span><span class=\"n\">{}</span>",
@@ -428,7 +444,7 @@ fn signal_figures(page: &mut String, number: usize, name: &str, unit: &str, pict
             index: 0,
             title: "What is left: recorded − simulated".to_owned(),
             axes: format!("{unit} over time, s"),
-            caption: after.to_owned(),
+            caption: format!("{after} Hide “before” in the legend to see in detail what is left."),
         },
         &pictures.residual,
     );
@@ -441,7 +457,7 @@ fn signal_figures(page: &mut String, number: usize, name: &str, unit: &str, pict
                 kind: "against",
                 index,
                 title: format!("Residual against {variable}"),
-                axes: format!("{unit} over {variable}"),
+                axes: format!("recorded − simulated, {unit}"),
                 caption: "Dots: samples. Line and band: median and 5 … 95 % in bins.".to_owned(),
             },
             words,

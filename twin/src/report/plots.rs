@@ -86,6 +86,8 @@ struct Against {
 
 #[derive(Default, Serialize)]
 struct Bins {
+    /// True if each bin is one value of the variable.
+    discrete: bool,
     x: Vec<Option<f64>>,
     before: Vec<[f64; 3]>,
     after: Vec<[f64; 3]>,
@@ -553,7 +555,7 @@ fn bins(variable: &[f64], before: &[f64], after: &[f64], low: f64, width: f64) -
         }
         filled = joined;
     }
-    let mut bins = Bins::default();
+    let mut bins = Bins { discrete, ..Bins::default() };
     for [xs, mut befores, mut afters] in filled {
         if xs.is_empty() {
             continue;

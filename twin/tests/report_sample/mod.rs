@@ -41,19 +41,19 @@ pub fn plots(rows: usize) -> SignalPlots {
     let mut last = 0.0;
     for row in 0..rows {
         let t = row as f64 * STEP_S;
-        if row % 60 == 0 {
+        if row % 150 == 0 {
             let pick = f64::from(random.next_u32()) / f64::from(u32::MAX);
-            target = if pick < 0.25 { 0.0 } else if pick < 0.8 { 150.0 * (pick - 0.2) * (0.6 + 0.4 * (t / 600.0).sin()) } else { -400.0 * (pick - 0.8) };
+            target = if pick < 0.25 { 0.0 } else if pick < 0.8 { 190.0 * (pick - 0.2) * (0.6 + 0.4 * (t / 600.0).sin()) } else { -500.0 * (pick - 0.8) };
         }
-        drive += (target - drive) * 0.12;
-        let current = drive + 1.5 * (TAU * 0.35 * t).sin() * f64::from(u8::from(drive.abs() > 5.0));
+        drive += (target - drive) * 0.03;
+        let current = drive + 0.4 * (TAU * 0.21 * t).sin() * f64::from(u8::from(drive.abs() > 5.0));
         temperature += 1e-5 * (current * current * 0.02 - (temperature - 18.0) * 3.0);
         lagged += (current - lagged) * (1.0 - (-STEP_S / TAU_S).exp());
         lagged_fit += (current - lagged_fit) * (1.0 - (-STEP_S / (TAU_S * 1.01)).exp());
         let high = lagged.abs() > RANGE_LIMIT_A;
         let through = |x: f64, gain: f64, offset: f64| if high { gain * x + offset } else { x };
         // What no row of the library holds: a disturbance for three minutes.
-        let strange = if (2_400.0..2_580.0).contains(&t) { 0.9 * (TAU * t / 37.0).sin() } else { 0.0 };
+        let strange = if (2_400.0..2_580.0).contains(&t) { 4.0 * (TAU * t / 37.0).sin() } else { 0.0 };
         let recorded = through(lagged, GAIN_RATIO, OFFSET_A) + strange + 0.08 * noise(&mut random);
         let dropped = (15_000..15_120).contains(&row);
         plots.t_s.push(t);

@@ -33,12 +33,13 @@
     if (value === 0) return "0";
     const size = Math.abs(value);
     if (size >= 1e6 || size < 1e-4) return value.toExponential(Math.max(0, Math.min(3, Math.round(Math.log10(size / step))))).replace(/^-/, "−");
-    const decimals = Math.max(0, Math.min(8, Math.ceil(-Math.log10(step) - 1e-9)));
+    let decimals = 0;
+    while (decimals < 8 && Math.abs(step * 10 ** decimals - Math.round(step * 10 ** decimals)) > 1e-6 * step * 10 ** decimals) decimals++;
     return value.toFixed(decimals).replace(/^-/, "−");
   }
 
   function ticks(u, values) {
-    const step = values.length > 1 ? Math.abs(values[1] - values[0]) : 1;
+    const step = values.length > 1 ? Math.abs(values[1] - values[0]) || 1 : 1;
     return values.map((value) => (value === null ? "" : tick(value, step)));
   }
 
@@ -63,17 +64,17 @@
     };
   }
 
-  // As wide as its longest number.
-  function yAxis(values, log) {
+  // As wide as its longest number, but plots over the same time stand exactly below each other.
+  function yAxis(values, log, least) {
     const out = axis(values, log);
     out.size = (u, texts) => {
-      if (!texts || !texts.length) return 40;
+      if (!texts || !texts.length) return least;
       u.ctx.save();
       u.ctx.font = font;
       let widest = 0;
       for (const text of texts) widest = Math.max(widest, u.ctx.measureText(text || "").width);
       u.ctx.restore();
-      return Math.ceil(widest) + 18;
+      return Math.max(least, Math.ceil(widest) + 18);
     };
     return out;
   }
@@ -146,24 +147,42 @@
     against(signal, index) {
       const one = signal.against[index];
       const x = decode(one.x), before = decode(one.before), after = decode(one.after);
-      const rows = x.map((v, k) => [v, before[k], after[k], null, null, null, null, null, null]);
-      one.bins.x.forEach((v, k) => {
-        const b = one.bins.before[k], a = one.bins.after[k];
-        rows.push([v, null, null, b[0], b[1], b[2], a[0], a[1], a[2]]);
+      const bins = one.bins, rows = [];
+      // Values of a flag would hide each other: before stands left of the value, after right of it.
+      let gap = 0;
+      if (bins.discrete) {
+        gap = Infinity;
+        for (let k = 1; k < bins.x.length; k++) gap = Math.min(gap, bins.x[k] - bins.x[k - 1]);
+        if (!isFinite(gap)) gap = 1;
+      }
+      const aside = 0.18 * gap;
+      x.forEach((v, k) => {
+        if (!gap) { rows.push([v, before[k], after[k], null, null, null, null, null, null]); return; }
+        const scatter = 0.12 * gap * (((k * 0.618034) % 1) - 0.5);
+        rows.push([v - aside + scatter, before[k], null, null, null, null, null, null, null]);
+        rows.push([v + aside + scatter, null, after[k], null, null, null, null, null, null]);
+      });
+      bins.x.forEach((v, k) => {
+        const b = bins.before[k], a = bins.after[k];
+        if (!gap) { rows.push([v, null, null, b[0], b[1], b[2], a[0], a[1], a[2]]); return; }
+        rows.push([v - aside, null, null, b[0], b[1], b[2], null, null, null]);
+        rows.push([v + aside, null, null, null, null, null, a[0], a[1], a[2]]);
       });
       rows.sort((a, b) => a[0] - b[0]);
       const data = Array.from({ length: 9 }, (_, k) => rows.map((row) => row[k]));
-      const edge = (name, group) => line("", name, { width: 0, spanGaps: true, class: "quiet", twinGroup: group });
-      const middle = (label, name, group) => line(label, name, { width: 2.5, spanGaps: true, twinGroup: group });
+      const hidden = gap ? { paths: () => null } : {};
+      const edge = (name, group) => line("", name, Object.assign({ width: 0, spanGaps: true, class: "quiet", twinGroup: group }, hidden));
+      const middle = (label, name, group) => line(label, name, Object.assign({ width: 2.5, spanGaps: true, twinGroup: group }, hidden));
       return {
-        data, scatter: true, places: one.places, zero: true,
+        data, scatter: true, places: one.places, zero: true, margin: gap * 0.45,
+        discrete: gap ? { aside, bins, width: gap * 0.1 } : null,
         series: [
           { label: one.variable, value: (u, v) => number(v) },
           dots("", "before", "before"), dots("", "after", "after"),
           edge("before", "before"), middle("before", "before", "before"), edge("before", "before"),
           edge("after", "after"), middle("after", "after", "after"), edge("after", "after"),
         ],
-        bands: [
+        bands: gap ? [] : [
           { series: [5, 3], fill: () => clear("before", 0.16) },
           { series: [8, 6], fill: () => clear("after", 0.16) },
         ],
@@ -305,28 +324,30 @@
     let low = Infinity, high = -Infinity;
     for (const v of xs) if (v !== null) { low = Math.min(low, v); high = Math.max(high, v); }
     if (!(high > low)) { low -= 0.5; high += 0.5; }
-    const margin = part.scatter ? 0.02 * (high - low) : 0;
+    const margin = part.margin || (part.scatter ? 0.02 * (high - low) : 0);
     const whole = [low - margin, high + margin];
     const log = !!part.log;
     const options = {
       width: Math.max(200, area.clientWidth), height: wide[kind],
       series: part.series, bands: part.bands,
       scales: {
-        x: log ? { time: false, distr: 3, auto: false, min: whole[0], max: whole[1] } : { time: false, auto: false, min: whole[0], max: whole[1] },
+        x: { time: false, distr: log ? 3 : 1, auto: false, min: whole[0], max: whole[1], range: (u, min, max) => [min === null ? whole[0] : min, max === null ? whole[1] : max] },
         y: log ? { distr: 3 } : {},
       },
-      axes: [axis(log ? logTicks : ticks, log), yAxis(log ? logTicks : ticks, log)],
+      axes: [axis(log ? logTicks : ticks, log), yAxis(log ? logTicks : ticks, log, part.group ? 58 : 40)],
       cursor: { drag: { x: true, y: !!part.scatter, uni: 20 }, sync: part.group ? { key: part.group + figure.dataset.signal, setSeries: false } : undefined,
         points: { size: 7 }, focus: { prox: -1 } },
       legend: { live: true, markers: { width: 0, fill: (u, k) => (u.series[k].twinColour ? colour(u.series[k].twinColour) : "transparent") } },
       hooks: {
         drawClear: [shade(part.places)],
         drawAxes: part.zero ? [zeroLine] : [],
+        draw: part.discrete ? [boxes(part.discrete)] : [],
         setScale: [follow],
         setSeries: [together],
       },
     };
     options.axes[0].size = 34;
+    if (part.discrete) options.axes[0].splits = () => part.discrete.bins.x;
     const u = new uPlot(options, part.data, area);
     u.twin = { group: part.group ? part.group + figure.dataset.signal : null, whole, zoomed: false, kind };
     u.setScale("x", { min: whole[0], max: whole[1] });
@@ -336,6 +357,32 @@
     plots.push(u);
     hands(u, area);
     tools(u, figure, figure.querySelector("h4").textContent);
+  }
+
+  // Median and 5 … 95 % at each value of a flag.
+  function boxes(discrete) {
+    return (u) => {
+      const ctx = u.ctx;
+      ctx.save();
+      ctx.beginPath();
+      ctx.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
+      ctx.clip();
+      for (const [name, side, index] of [["before", -1, 4], ["after", 1, 7]]) {
+        if (!u.series[index].show) continue;
+        discrete.bins.x.forEach((value, k) => {
+          const [low, middle, high] = discrete.bins[name][k];
+          if (middle === null) return;
+          const centre = value + side * discrete.aside;
+          const left = u.valToPos(centre - discrete.width, "x", true), right = u.valToPos(centre + discrete.width, "x", true);
+          const y = (v) => u.valToPos(v, "y", true);
+          ctx.fillStyle = clear(name, 0.3);
+          ctx.fillRect(left, y(high), right - left, Math.max(y(low) - y(high), devicePixelRatio));
+          ctx.fillStyle = colour(name);
+          ctx.fillRect(left, y(middle) - 1.5 * devicePixelRatio, right - left, 3 * devicePixelRatio);
+        });
+      }
+      ctx.restore();
+    };
   }
 
   function zeroLine(u) {
