@@ -2,7 +2,10 @@
 
 use super::{
     data::{EffectReport, Report, SignalReport},
-    format::{change, meaning, p_value, percent, place, quantity, significant, unit_of, verdict, with_interval},
+    format::{
+        change, meaning, p_value, percent, place, quantity, significant, unit_of, verdict,
+        with_interval,
+    },
 };
 
 /// Lines of a small terminal, less one for its prompt.
@@ -38,15 +41,28 @@ fn finish(lines: &[String]) -> String {
 /// The screen with so many entries of each kind.
 fn screen(report: &Report, width: usize, entries: usize) -> Vec<String> {
     let mut lines = Vec::new();
-    let mut push = |text: String, indent: usize, most: usize| wrap(&mut lines, &text, indent, width, most);
+    let mut push =
+        |text: String, indent: usize, most: usize| wrap(&mut lines, &text, indent, width, most);
 
     let summary = report.summary.trim();
-    let summary = if summary.is_empty() { meaning(report.verdict) } else { summary };
-    push(format!("{}. {summary}", verdict(report.verdict).to_uppercase()), 0, if entries > 2 { 5 } else { 3 });
+    let summary = if summary.is_empty() {
+        meaning(report.verdict)
+    } else {
+        summary
+    };
+    push(
+        format!("{}. {summary}", verdict(report.verdict).to_uppercase()),
+        0,
+        if entries > 2 { 5 } else { 3 },
+    );
 
     let signals = entries.max(1);
     if !report.signals.is_empty() {
-        push("Error (RMS), held out before → after; all samples; noise floor".to_owned(), 0, 1);
+        push(
+            "Error (RMS), held out before → after; all samples; noise floor".to_owned(),
+            0,
+            1,
+        );
     }
     for signal in report.signals.iter().take(signals) {
         push(errors(signal), 2, 1);
@@ -76,8 +92,16 @@ fn screen(report: &Report, width: usize, entries: usize) -> Vec<String> {
     for effect in report.effects.iter().take(effects) {
         push(named(effect), 2, if entries > 1 { 2 } else { 1 });
         if !effect.equivalent_to.is_empty() {
-            let separated = if effect.separated_by.is_empty() { String::new() } else { format!("; separated by: {}", effect.separated_by) };
-            push(format!("or {}{separated}", effect.equivalent_to.join(", ")), 4, if entries > 2 { 2 } else { 1 });
+            let separated = if effect.separated_by.is_empty() {
+                String::new()
+            } else {
+                format!("; separated by: {}", effect.separated_by)
+            };
+            push(
+                format!("or {}{separated}", effect.equivalent_to.join(", ")),
+                4,
+                if entries > 2 { 2 } else { 1 },
+            );
         }
     }
     more(&mut push, report.effects.len(), effects);
@@ -102,7 +126,11 @@ fn screen(report: &Report, width: usize, entries: usize) -> Vec<String> {
     }
 
     for left in report.unexplained.iter().take(signals) {
-        let at = left.location.as_ref().map(|location| format!("; largest at {}", place(location))).unwrap_or_default();
+        let at = left
+            .location
+            .as_ref()
+            .map(|location| format!("; largest at {}", place(location)))
+            .unwrap_or_default();
         push(
             format!(
                 "Unexplained in {}: {}; {} of its energy explainable{at}",
@@ -115,7 +143,11 @@ fn screen(report: &Report, width: usize, entries: usize) -> Vec<String> {
         );
     }
     for remark in report.remarks.iter().take(entries.saturating_sub(1).min(2)) {
-        push(format!("Note: {remark}"), 0, if entries > 3 { 2 } else { 1 });
+        push(
+            format!("Note: {remark}"),
+            0,
+            if entries > 3 { 2 } else { 1 },
+        );
     }
 
     let files = match &report.inputs.out {
@@ -125,7 +157,15 @@ fn screen(report: &Report, width: usize, entries: usize) -> Vec<String> {
         }
         None => "All of it: report.html, report.json, model.toml".to_owned(),
     };
-    push(format!("{files}  ({} s, seed {})", significant(report.seconds, 2), report.seed), 0, 2);
+    push(
+        format!(
+            "{files}  ({} s, seed {})",
+            significant(report.seconds, 2),
+            report.seed
+        ),
+        0,
+        2,
+    );
     lines
 }
 
@@ -136,7 +176,11 @@ fn more(push: &mut impl FnMut(String, usize, usize), all: usize, shown: usize) {
 }
 
 fn bracketed(text: &str) -> String {
-    if text.is_empty() { String::new() } else { format!(" ({text})") }
+    if text.is_empty() {
+        String::new()
+    } else {
+        format!(" ({text})")
+    }
 }
 
 fn errors(signal: &SignalReport) -> String {
@@ -145,7 +189,10 @@ fn errors(signal: &SignalReport) -> String {
         signal.name,
         significant(signal.held_out_blocks_before, 3),
         quantity(&significant(signal.held_out_blocks_after, 3), &signal.unit),
-        bracketed(&change(signal.held_out_blocks_before, signal.held_out_blocks_after)),
+        bracketed(&change(
+            signal.held_out_blocks_before,
+            signal.held_out_blocks_after
+        )),
         significant(signal.rmse_before, 3),
         significant(signal.rmse_after, 3),
         significant(signal.noise_floor, 2),
@@ -158,7 +205,11 @@ fn named(effect: &EffectReport) -> String {
         .iter()
         .map(|parameter| {
             let [value, low, high] = with_interval(parameter.value, parameter.ci95);
-            format!("{} {} ({low} … {high})", parameter.name, quantity(&value, &parameter.unit))
+            format!(
+                "{} {} ({low} … {high})",
+                parameter.name,
+                quantity(&value, &parameter.unit)
+            )
         })
         .collect();
     format!(
@@ -176,13 +227,21 @@ fn tail(text: &str, most: usize) -> String {
     if length <= most {
         return text.to_owned();
     }
-    format!("…{}", text.chars().skip(length + 1 - most.max(1)).collect::<String>())
+    format!(
+        "…{}",
+        text.chars()
+            .skip(length + 1 - most.max(1))
+            .collect::<String>()
+    )
 }
 
 /// Adds `text` in lines of `width`, at most `most` of them; the last ends in `…` if more was to say.
 fn wrap(lines: &mut Vec<String>, text: &str, indent: usize, width: usize, most: usize) {
     // A terminal obeys control characters: none may come from a file's name.
-    let clean: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    let clean: String = text
+        .chars()
+        .map(|c| if c.is_control() { ' ' } else { c })
+        .collect();
     let mut wrapped: Vec<String> = Vec::new();
     // Continued lines stand two further in.
     let room_of = |wrapped: &[String]| width - indent - if wrapped.is_empty() { 0 } else { 2 };
