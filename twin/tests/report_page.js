@@ -74,6 +74,7 @@ addEventListener("load", async () => {
       for (let k = 0; k < 100; k++) { key("+"); await Promise.resolve(); }
       await share("in beyond every sample");
       key("0");
+      await settle();
       const entry = below.querySelectorAll(".u-series")[1], range = below.twinPlot.scales.y.max - below.twinPlot.scales.y.min;
       entry.querySelector("th").click();
       await settle();

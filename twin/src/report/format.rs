@@ -40,8 +40,8 @@ pub fn at_most(value: f64, digits: usize) -> String {
     )
 }
 
-/// A value and the ends of its interval, all to the place that half the interval resolves: with two digits below 3, else
-/// with one.
+/// A value and the ends of its interval, all to the place that half the interval resolves: with two digits if it
+/// begins with 1 to 4, else with one.
 pub fn with_interval(value: f64, interval: [f64; 2]) -> [String; 3] {
     let [low, high] = interval;
     let half = (high - low) / 2.0;
@@ -50,7 +50,7 @@ pub fn with_interval(value: f64, interval: [f64; 2]) -> [String; 3] {
     }
     let size = value.abs().max(low.abs()).max(high.abs());
     let half = format!("{half:.1e}");
-    let place = exponent_of(&half) - i32::from(half.starts_with(['1', '2']));
+    let place = exponent_of(&half) - i32::from(half.starts_with(['1', '2', '3', '4']));
     let exponent = exponent_of(&format!("{size:.1e}"));
     if !(-4..6).contains(&exponent) {
         let digits = (exponent - place).max(0) as usize;

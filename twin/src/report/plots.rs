@@ -527,12 +527,11 @@ fn against(
     let stride = total.div_ceil(points).max(1);
     let mut drawn = Vec::with_capacity(points + 4 * EXTREME_COLUMNS);
     let mut extremes: Vec<Option<[usize; 4]>> = vec![None; EXTREME_COLUMNS];
-    let mut counted = 0;
-    for row in (0..variable.len()).filter(|row| usable(*row)) {
+    let usable_rows = (0..variable.len()).filter(|row| usable(*row));
+    for (counted, row) in usable_rows.enumerate() {
         if counted % stride == 0 {
             drawn.push(row);
         }
-        counted += 1;
         let column = (((variable[row] - low) / width * EXTREME_COLUMNS as f64) as usize)
             .min(EXTREME_COLUMNS - 1);
         let extreme = extremes[column].get_or_insert([row; 4]);

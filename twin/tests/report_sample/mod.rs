@@ -110,7 +110,7 @@ pub fn plots(rows: usize) -> SignalPlots {
 
 /// A plain transform of two-minute blocks, averaged.
 fn spectrum(plots: &SignalPlots) -> Vec<(f64, f64, f64)> {
-    const BLOCK: usize = 1_024;
+    const BLOCK: usize = 512;
     let clean = |v: f64| if v.is_finite() { v } else { 0.0 };
     let before: Vec<f64> = plots
         .recorded
@@ -125,7 +125,7 @@ fn spectrum(plots: &SignalPlots) -> Vec<(f64, f64, f64)> {
         .map(|(r, s)| clean(r - s))
         .collect();
     let density = |series: &[f64], line: usize| {
-        let blocks = series.chunks_exact(BLOCK).take(12);
+        let blocks = series.chunks_exact(BLOCK).take(8);
         let count = blocks.len().max(1) as f64;
         let power: f64 = blocks
             .map(|block| {

@@ -235,7 +235,8 @@
     if (min <= whole[0] && max >= whole[1]) { reset(u); return; }
     min = Math.max(min, whole[0]);
     max = Math.min(max, whole[1]);
-    if (!(max - min > 1e-9 * (whole[1] - whole[0]))) return;
+    // Nor further in than a fraction of a sample.
+    if (!(max - min > (0.2 / u.data[0].length) * (whole[1] - whole[0]))) return;
     u.setScale("x", { min, max });
   }
   function pan(u, share) {
