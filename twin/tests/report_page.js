@@ -81,6 +81,20 @@ addEventListener("load", async () => {
       found.steps["hidden before"] = (below.twinPlot.scales.y.max - below.twinPlot.scales.y.min) / range;
       entry.querySelector("th").click();
       await settle();
+      const scatter = areas.find((area) => area.parentElement.dataset.plot === "against");
+      if (scatter) {
+        const v = scatter.twinPlot, height = () => v.scales.y.max - v.scales.y.min, all = height();
+        const inside = v.over.getBoundingClientRect();
+        const point = (x, y) => ({ clientX: inside.left + x * inside.width, clientY: inside.top + y * inside.height, movementX: 9, movementY: 9, bubbles: true, cancelable: true, view: window });
+        for (const [kind, x, y] of [["mouseenter", 0.2, 0.25], ["mousemove", 0.2, 0.25], ["mousedown", 0.2, 0.25], ["mousemove", 0.7, 0.75], ["mouseup", 0.7, 0.75]]) {
+          v.over.dispatchEvent(new MouseEvent(kind, point(x, y)));
+        }
+        await settle();
+        found.steps["scatter dragged"] = height() / all;
+        scatter.dispatchEvent(new KeyboardEvent("keydown", { key: "0", bubbles: true, cancelable: true }));
+        await settle();
+        found.steps["scatter reset"] = height() / all;
+      }
       dispatchEvent(new Event("beforeprint"));
       await settle();
       found.steps["width in print"] = u.width;

@@ -263,6 +263,8 @@ fn plots_zoom_by_drag_wheel_keys_buttons_and_fingers() {
         step(found, "hidden before") < 0.6,
         "hiding the larger residual does not show the smaller: {found}"
     );
+    near(found, "scatter dragged", 0.5, 0.02);
+    near(found, "scatter reset", 1.0, 1e-6);
     near(found, "width in print", 640.0, 0.0);
     near(found, "white in print", 1.0, 0.0);
     near(found, "width after print", 1.0, 1e-9);

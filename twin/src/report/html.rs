@@ -83,6 +83,16 @@ fn escape(text: &str) -> String {
     safe
 }
 
+/// A name of a column or parameter. Only a long one may be broken: `i_mea` and `s_a` on two lines are hard to read.
+fn code(name: &str) -> String {
+    let class = if name.chars().count() > 20 {
+        " class=\"long\""
+    } else {
+        ""
+    };
+    format!("<code{class}>{}</code>", escape(name))
+}
+
 fn head(page: &mut String, report: &Report) {
     page.push_str(
         "<header>\n<p class=\"kicker\">Why the recording and the simulation disagree</p>\n",
@@ -136,7 +146,7 @@ fn answer(page: &mut String, report: &Report) {
         Verdict::Explained => ("good", "✓"),
         Verdict::PartlyExplained => ("part", "◐"),
         Verdict::Ambiguous => ("part", "≟"),
-        Verdict::Unknown => ("open", "?"),
+        Verdict::Unknown => ("unknown", "?"),
     };
     page.push_str(&format!(
         "<section class=\"verdict {class}\" aria-labelledby=\"verdict\">\n<h2 id=\"verdict\"><span class=\"sign\" aria-hidden=\"true\">{sign}</span>{}</h2>\n",
@@ -152,8 +162,8 @@ fn answer(page: &mut String, report: &Report) {
     for signal in &report.signals {
         let improved = change(signal.held_out_blocks_before, signal.held_out_blocks_after);
         page.push_str(&format!(
-            "<div><dt>Held-out error of <code>{}</code></dt><dd>{}<strong>{}</strong>{}</dd></div>",
-            escape(&signal.name),
+            "<div><dt>Held-out error of {}</dt><dd>{}<strong>{}</strong>{}</dd></div>",
+            code(&signal.name),
             if report.effects.is_empty() {
                 String::new()
             } else {
@@ -250,10 +260,10 @@ fn places(page: &mut String, report: &Report) {
     for location in &report.locations {
         let density = location.energy_share / location.sample_share;
         page.push_str(&format!(
-            "<tr><th scope=\"row\">{}</th><td data-label=\"Signal\"><code>{}</code></td><td data-label=\"Energy\">{}</td><td data-label=\"Samples\">{}</td>\
+            "<tr><th scope=\"row\" class=\"long\">{}</th><td data-label=\"Signal\">{}</td><td data-label=\"Energy\">{}</td><td data-label=\"Samples\">{}</td>\
              <td class=\"n\" data-label=\"Density\">{}</td><td class=\"p\" data-label=\"p\">{}</td><td data-label=\"Effect\">{}</td></tr>\n",
             escape(&place(location)),
-            escape(&location.signal),
+            code(&location.signal),
             bar(location.energy_share, "energy"),
             bar(location.sample_share, "samples"),
             if density.is_finite() { format!("×{}", significant(density, 2)) } else { String::new() },
@@ -274,7 +284,7 @@ fn accounted_for(report: &Report, location: &Location) -> String {
             )
         }
         Some(effect) => escape(effect),
-        None => "<span class=\"open\">nothing named</span>".to_owned(),
+        None => "<span class=\"gap\">nothing named</span>".to_owned(),
     }
 }
 
@@ -296,9 +306,9 @@ fn effects(page: &mut String, report: &Report) {
 fn one_effect(page: &mut String, effect: &EffectReport) {
     let id = anchor(&effect.id);
     page.push_str(&format!(
-        "<article class=\"effect\" aria-labelledby=\"effect-{id}\">\n<h3 id=\"effect-{id}\">{}</h3>\n<p class=\"where\">shows in <code>{}</code></p>\n<p>{}</p>\n",
+        "<article class=\"effect\" aria-labelledby=\"effect-{id}\">\n<h3 id=\"effect-{id}\">{}</h3>\n<p class=\"where\">shows in {}</p>\n<p>{}</p>\n",
         escape(&effect.id),
-        escape(&effect.signal),
+        code(&effect.signal),
         escape(&effect.statement)
     ));
     if !effect.equation.is_empty() {
@@ -315,8 +325,8 @@ fn one_effect(page: &mut String, effect: &EffectReport) {
         for parameter in &effect.parameters {
             let [value, low, high] = with_interval(parameter.value, parameter.ci95);
             page.push_str(&format!(
-                "<tr><th scope=\"row\"><code>{}</code></th><td class=\"n\" data-label=\"Value\">{}</td><td class=\"n\" data-label=\"95 % interval\">{} … {}</td><td class=\"wide\">{}</td></tr>\n",
-                escape(&parameter.name),
+                "<tr><th scope=\"row\">{}</th><td class=\"n\" data-label=\"Value\">{}</td><td class=\"n\" data-label=\"95 % interval\">{} … {}</td><td class=\"wide\">{}</td></tr>\n",
+                code(&parameter.name),
                 escape(&quantity(&value, &parameter.unit)),
                 low,
                 escape(&quantity(&high, &parameter.unit)),
@@ -339,11 +349,7 @@ fn one_effect(page: &mut String, effect: &EffectReport) {
             "<p>Nothing in the library: no other effect fits this recording as well.</p>\n",
         );
     } else {
-        let names: Vec<String> = effect
-            .equivalent_to
-            .iter()
-            .map(|id| format!("<code>{}</code>", escape(id)))
-            .collect();
+        let names: Vec<String> = effect.equivalent_to.iter().map(|id| code(id)).collect();
         page.push_str(&format!(
             "<p class=\"confused\">On this recording it cannot be told apart from {}.",
             names.join(", ")
@@ -391,7 +397,7 @@ fn interval(parameter: &ParameterReport) -> String {
     let [low, high] = parameter.ci95;
     let value = parameter.value;
     if ![low, high, value].iter().all(|v| v.is_finite()) || high < low {
-        return "<span class=\"open\">not bounded</span>".to_owned();
+        return "<span class=\"gap\">not bounded</span>".to_owned();
     }
     let off = parameter.off.filter(|v| v.is_finite());
     let (mut from, mut to) = (low.min(value), high.max(value));
@@ -445,8 +451,8 @@ fn before_and_after(page: &mut String, report: &Report, drawn: &[(usize, Picture
             };
             let strong = |text: String| format!("<td class=\"n\"><strong>{text}</strong></td>");
             page.push_str(&format!(
-                "<tr><th scope=\"row\"><code>{}</code></th>{}{}{}{}{}<td class=\"n\">{}</td>{}<td class=\"n\">{}</td></tr>\n",
-                escape(&signal.name),
+                "<tr><th scope=\"row\">{}</th>{}{}{}{}{}<td class=\"n\">{}</td>{}<td class=\"n\">{}</td></tr>\n",
+                code(&signal.name),
                 cell(signal.held_out_blocks_before),
                 cell(signal.held_out_blocks_after),
                 strong(change(signal.held_out_blocks_before, signal.held_out_blocks_after)),
@@ -472,15 +478,17 @@ fn before_and_after(page: &mut String, report: &Report, drawn: &[(usize, Picture
             continue;
         };
         page.push_str(&format!(
-            "<h3 class=\"signal\"><code>{}</code></h3>\n",
-            escape(&plots.name)
+            "<h3 class=\"signal\">{}</h3>\n",
+            code(&plots.name)
         ));
         if let Some(signal) = report
             .signals
             .iter()
             .find(|signal| signal.name == plots.name)
         {
-            error_bars(page, signal);
+            if !pictures.same {
+                error_bars(page, signal);
+            }
         }
         signal_figures(page, number, &plots.name, &plots.unit, pictures);
     }
@@ -612,7 +620,7 @@ fn signal_figures(page: &mut String, number: usize, name: &str, unit: &str, pict
                 kind: "against",
                 index,
                 title: format!("Residual against {variable}"),
-                axes: format!("recorded − simulated, {unit}"),
+                axes: format!("residual, {unit}"),
                 caption: "Dots: samples. Line and band: median and 5 … 95 % in bins.".to_owned(),
             },
             words,
@@ -647,13 +655,13 @@ fn holdouts(page: &mut String, report: &Report) {
         let unit = unit_of(report, &holdout.signal);
         let worse = holdout.rmse_after > holdout.rmse_before;
         page.push_str(&format!(
-            "<tr><th scope=\"row\">{}</th><td data-label=\"Signal\"><code>{}</code></td><td class=\"n\" data-label=\"RMSE before\">{}</td><td class=\"n\" data-label=\"RMSE after\">{}</td>\
+            "<tr><th scope=\"row\" class=\"long\">{}</th><td data-label=\"Signal\">{}</td><td class=\"n\" data-label=\"RMSE before\">{}</td><td class=\"n\" data-label=\"RMSE after\">{}</td>\
              <td class=\"n\" data-label=\"Change\"><strong{}>{}</strong></td></tr>\n",
             escape(&holdout.file),
-            escape(&holdout.signal),
+            code(&holdout.signal),
             escape(&quantity(&significant(holdout.rmse_before, 3), unit)),
             escape(&quantity(&significant(holdout.rmse_after, 3), unit)),
-            if worse { " class=\"open\"" } else { "" },
+            if worse { " class=\"gap\"" } else { "" },
             change(holdout.rmse_before, holdout.rmse_after) + if worse { " (worse)" } else { "" },
         ));
     }
@@ -678,8 +686,8 @@ fn unexplained(page: &mut String, report: &Report) {
             .find(|signal| signal.name == left.signal)
             .map_or(f64::NAN, |signal| signal.noise_floor);
         page.push_str(&format!(
-            "<tr><th scope=\"row\"><code>{}</code></th><td class=\"n\" data-label=\"Left (RMS)\">{}</td><td class=\"n\" data-label=\"Noise floor\">{}</td><td data-label=\"Explainable\">{}</td><td data-label=\"Largest at\">{}</td></tr>\n",
-            escape(&left.signal),
+            "<tr><th scope=\"row\">{}</th><td class=\"n\" data-label=\"Left (RMS)\">{}</td><td class=\"n\" data-label=\"Noise floor\">{}</td><td data-label=\"Explainable\">{}</td><td data-label=\"Largest at\">{}</td></tr>\n",
+            code(&left.signal),
             escape(&quantity(&significant(left.rmse, 3), unit)),
             escape(&quantity(&significant(floor, 3), unit)),
             bar(left.explainable_share, "energy"),

@@ -404,7 +404,7 @@ pub fn ambiguous() -> Report {
 pub fn unknown() -> Report {
     let mut report = partly_explained();
     report.verdict = Verdict::Unknown;
-    report.summary = "There is a mismatch of 1.4 A, most of it while the current changes, and no model of the library accounts for it.".to_owned();
+    report.summary = "There is a mismatch of 2.3 A, most of it while the current changes, and no model of the library accounts for it.".to_owned();
     report.effects.clear();
     report.holdouts.clear();
     for location in &mut report.locations {

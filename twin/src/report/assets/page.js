@@ -125,6 +125,7 @@
       ctx.clip();
       ctx.fillStyle = colour("shade");
       ctx.strokeStyle = colour("shade-edge");
+      ctx.setLineDash([]);
       ctx.lineWidth = devicePixelRatio;
       for (const place of places) {
         const from = place.from === null ? u.bbox.left - 9 : u.valToPos(place.from, "x", true);
@@ -253,6 +254,17 @@
   }
   function reset(u) {
     u.setScale("x", { min: u.twin.whole[0], max: u.twin.whole[1] });
+    if (!u.twin.scatter) return;
+    // Here dragging sets the height too, and it has to be given back.
+    let low = Infinity, high = -Infinity;
+    u.data.forEach((values, k) => {
+      if (k === 0 || !u.series[k].show) return;
+      for (const v of values) if (v !== null) { low = Math.min(low, v); high = Math.max(high, v); }
+    });
+    if (low <= high) {
+      const [min, max] = uPlot.rangeNum(low, high, 0.1, true);
+      u.setScale("y", { min, max });
+    }
   }
 
   let following = false;
@@ -368,9 +380,11 @@
       },
     };
     options.axes[0].size = 34;
+    // Long numbers need room.
+    options.axes[0].space = 40 + 5 * Math.max(number(whole[0]).length, number(Math.round(whole[1])).length);
     if (part.discrete) options.axes[0].splits = () => part.discrete.bins.x;
     const u = new uPlot(options, part.data, area);
-    u.twin = { group: part.group ? part.group + figure.dataset.signal : null, whole, zoomed: false, kind };
+    u.twin = { group: part.group ? part.group + figure.dataset.signal : null, whole, zoomed: false, scatter: !!part.scatter };
     u.setScale("x", { min: whole[0], max: whole[1] });
     // uPlot's own double click shows the data's range; this one the range that was drawn first.
     u.over.addEventListener("dblclick", () => reset(u));
@@ -412,6 +426,7 @@
     const y = Math.round(u.valToPos(0, "y", true)) + 0.5;
     u.ctx.save();
     u.ctx.strokeStyle = colour("soft");
+    u.ctx.setLineDash([]);
     u.ctx.lineWidth = devicePixelRatio;
     u.ctx.beginPath();
     u.ctx.moveTo(u.bbox.left, y);
