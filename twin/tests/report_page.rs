@@ -31,9 +31,9 @@ fn chromium() -> PathBuf {
         return PathBuf::from(named);
     }
     env::split_paths(&env::var_os("PATH").unwrap_or_default())
-        .map(|folder| folder.join("chromium"))
+        .flat_map(|folder| ["chromium", "chromium-headless-shell"].map(|name| folder.join(name)))
         .find(|file| file.is_file())
-        .expect("no browser: HALLMARK_CHROMIUM is not set and there is no chromium on PATH; `cargo xtask test` installs it")
+        .expect("no browser: HALLMARK_CHROMIUM is not set and there is no chromium or chromium-headless-shell on PATH; `cargo xtask test` installs it")
 }
 
 /// Opens a page of so many pixels' width, in a frame: a window cannot be as narrow as a phone.

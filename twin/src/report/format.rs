@@ -105,14 +105,12 @@ pub fn change(before: f64, after: f64) -> String {
     )
 }
 
-/// `p < 0.001`, `p = 0.012`.
+/// A p-value: `< 0.001`, `0.012`.
 pub fn p_value(p: f64) -> String {
-    if !p.is_finite() {
-        "p unknown".to_owned()
-    } else if p < 0.001 {
-        "p < 0.001".to_owned()
+    if p < 0.001 {
+        "< 0.001".to_owned()
     } else {
-        format!("p = {}", significant(p, 2))
+        significant(p, 2)
     }
 }
 
@@ -264,8 +262,8 @@ mod tests {
         assert_eq!(change(0.5, 0.55), "+10 %");
         assert_eq!(change(1.0, 0.000_1), "−99.9 %");
         assert_eq!(change(0.0, 0.1), "");
-        assert_eq!(p_value(0.000_2), "p < 0.001");
-        assert_eq!(p_value(0.012), "p = 0.012");
+        assert_eq!(p_value(0.000_2), "< 0.001");
+        assert_eq!(p_value(0.012), "0.012");
         assert_eq!(grouped(36_000), "36,000");
         assert_eq!(grouped(999), "999");
         assert_eq!(at_most(3.0, 4), "3");

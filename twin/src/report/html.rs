@@ -93,6 +93,16 @@ fn code(name: &str) -> String {
     format!("<code{class}>{}</code>", escape(name))
 }
 
+/// The first cell of a row of text.
+fn row_head(text: &str) -> String {
+    let class = if text.chars().count() > 36 {
+        " class=\"long\""
+    } else {
+        ""
+    };
+    format!("<th scope=\"row\"{class}>{}</th>", escape(text))
+}
+
 fn head(page: &mut String, report: &Report) {
     page.push_str(
         "<header>\n<p class=\"kicker\">Why the recording and the simulation disagree</p>\n",
@@ -186,10 +196,9 @@ fn answer(page: &mut String, report: &Report) {
         return;
     }
     page.push_str("<ul class=\"named\">");
-    for effect in &report.effects {
+    for (number, effect) in report.effects.iter().enumerate() {
         page.push_str(&format!(
-            "<li><a href=\"#effect-{}\">{}</a>: ",
-            anchor(&effect.id),
+            "<li><a href=\"#effect-{number}\">{}</a>: ",
             escape(&effect.id)
         ));
         let parameters: Vec<String> = effect.parameters.iter().map(in_words).collect();
@@ -212,19 +221,6 @@ fn in_words(parameter: &ParameterReport) -> String {
         parameter.name,
         quantity(&value, &parameter.unit)
     )
-}
-
-/// An id is used in the page as an anchor: letters, digits and hyphens only.
-fn anchor(id: &str) -> String {
-    id.chars()
-        .map(|c| {
-            if c.is_ascii_alphanumeric() || c == '-' {
-                c
-            } else {
-                '_'
-            }
-        })
-        .collect()
 }
 
 /// A share as a bar with its number.
@@ -260,14 +256,14 @@ fn places(page: &mut String, report: &Report) {
     for location in &report.locations {
         let density = location.energy_share / location.sample_share;
         page.push_str(&format!(
-            "<tr><th scope=\"row\" class=\"long\">{}</th><td data-label=\"Signal\">{}</td><td data-label=\"Energy\">{}</td><td data-label=\"Samples\">{}</td>\
+            "<tr>{}<td data-label=\"Signal\">{}</td><td data-label=\"Energy\">{}</td><td data-label=\"Samples\">{}</td>\
              <td class=\"n\" data-label=\"Density\">{}</td><td class=\"p\" data-label=\"p\">{}</td><td data-label=\"Effect\">{}</td></tr>\n",
-            escape(&place(location)),
+            row_head(&place(location)),
             code(&location.signal),
             bar(location.energy_share, "energy"),
             bar(location.sample_share, "samples"),
             if density.is_finite() { format!("×{}", significant(density, 2)) } else { String::new() },
-            p_value(location.p_value).trim_start_matches("p = ").trim_start_matches("p ").replace('<', "&lt; ").replace("  ", " "),
+            escape(&p_value(location.p_value)),
             accounted_for(report, location),
         ));
     }
@@ -275,16 +271,18 @@ fn places(page: &mut String, report: &Report) {
 }
 
 fn accounted_for(report: &Report, location: &Location) -> String {
-    match &location.effect {
-        Some(effect) if report.effects.iter().any(|named| named.id == *effect) => {
-            format!(
-                "<a href=\"#effect-{}\">{}</a>",
-                anchor(effect),
-                escape(effect)
-            )
-        }
-        Some(effect) => escape(effect),
-        None => "<span class=\"gap\">nothing named</span>".to_owned(),
+    let Some(id) = &location.effect else {
+        return "<span class=\"gap\">nothing named</span>".to_owned();
+    };
+    // The same effect may be named in two signals.
+    let find = |same_signal: bool| {
+        report.effects.iter().position(|effect| {
+            effect.id == *id && (!same_signal || effect.signal == location.signal)
+        })
+    };
+    match find(true).or_else(|| find(false)) {
+        Some(number) => format!("<a href=\"#effect-{number}\">{}</a>", escape(id)),
+        None => escape(id),
     }
 }
 
@@ -297,16 +295,15 @@ fn effects(page: &mut String, report: &Report) {
             "<p>None is named: no effect of the library held on samples that were not fitted, and beat its placebos.</p>\n"
         });
     }
-    for effect in &report.effects {
-        one_effect(page, effect);
+    for (number, effect) in report.effects.iter().enumerate() {
+        one_effect(page, number, effect);
     }
     page.push_str("</section>\n");
 }
 
-fn one_effect(page: &mut String, effect: &EffectReport) {
-    let id = anchor(&effect.id);
+fn one_effect(page: &mut String, number: usize, effect: &EffectReport) {
     page.push_str(&format!(
-        "<article class=\"effect\" aria-labelledby=\"effect-{id}\">\n<h3 id=\"effect-{id}\">{}</h3>\n<p class=\"where\">shows in {}</p>\n<p>{}</p>\n",
+        "<article class=\"effect\" aria-labelledby=\"effect-{number}\">\n<h3 id=\"effect-{number}\">{}</h3>\n<p class=\"where\">shows in {}</p>\n<p>{}</p>\n",
         escape(&effect.id),
         code(&effect.signal),
         escape(&effect.statement)
@@ -469,7 +466,7 @@ fn before_and_after(page: &mut String, report: &Report, drawn: &[(usize, Picture
         page.push_str(
             "<p class=\"hint screen\">Drag over a plot to zoom in; double-click to see all. Click a plot and its wheel zooms, too (or hold Ctrl). \
              With the keyboard: <kbd>+</kbd> <kbd>−</kbd> zoom, <kbd>←</kbd> <kbd>→</kbd> move, <kbd>0</kbd> shows all. By touch: two fingers. \
-             A click on a name of the legend hides its line. Shaded: the places of the table above.</p>\n\
+             A click on a name of the legend hides its line. Shaded: places of the table above.</p>\n\
              <noscript><p class=\"hint\">The plots are drawn by a script, which this browser does not run. Every number is in the tables and texts.</p></noscript>\n",
         );
     }
@@ -481,14 +478,10 @@ fn before_and_after(page: &mut String, report: &Report, drawn: &[(usize, Picture
             "<h3 class=\"signal\">{}</h3>\n",
             code(&plots.name)
         ));
-        if let Some(signal) = report
-            .signals
-            .iter()
-            .find(|signal| signal.name == plots.name)
-        {
-            if !pictures.same {
-                error_bars(page, signal);
-            }
+        let mut signals = report.signals.iter();
+        let signal = signals.find(|signal| signal.name == plots.name);
+        if let Some(signal) = signal.filter(|_| !pictures.same) {
+            error_bars(page, signal);
         }
         signal_figures(page, number, &plots.name, &plots.unit, pictures);
     }
@@ -578,39 +571,43 @@ fn signal_figures(page: &mut String, number: usize, name: &str, unit: &str, pict
     } else {
         "After: the fitted model."
     };
-    figure(
-        page,
-        &Figure {
-            signal: number,
-            kind: "time",
-            index: 0,
-            title: "Recorded and simulated".to_owned(),
-            axes: format!("{per_second} over time, s"),
-            caption: if pictures.same {
-                "Recorded and simulated."
-            } else {
-                "Recorded, as simulated before, and as simulated with the effects above."
-            }
-            .to_owned(),
-        },
-        &pictures.time,
-    );
-    figure(
-        page,
-        &Figure {
-            signal: number,
-            kind: "residual",
-            index: 0,
-            title: "What is left: recorded − simulated".to_owned(),
-            axes: format!("{unit} over time, s"),
-            caption: if pictures.same {
-                after.to_owned()
-            } else {
-                format!("{after} Hide “before” in the legend to see in detail what is left.")
+    if let Some(words) = &pictures.time {
+        figure(
+            page,
+            &Figure {
+                signal: number,
+                kind: "time",
+                index: 0,
+                title: "Recorded and simulated".to_owned(),
+                axes: format!("{per_second} over time, s"),
+                caption: if pictures.same {
+                    "Recorded and simulated."
+                } else {
+                    "Recorded, as simulated before, and as simulated with the effects above."
+                }
+                .to_owned(),
             },
-        },
-        &pictures.residual,
-    );
+            words,
+        );
+    }
+    if let Some(words) = &pictures.residual {
+        figure(
+            page,
+            &Figure {
+                signal: number,
+                kind: "residual",
+                index: 0,
+                title: "What is left: recorded − simulated".to_owned(),
+                axes: format!("{unit} over time, s"),
+                caption: if pictures.same {
+                    after.to_owned()
+                } else {
+                    format!("{after} Hide “before” in the legend to see in detail what is left.")
+                },
+            },
+            words,
+        );
+    }
     page.push_str("<div class=\"grid\">\n");
     for (index, (variable, words)) in pictures.against.iter().enumerate() {
         figure(
@@ -655,9 +652,9 @@ fn holdouts(page: &mut String, report: &Report) {
         let unit = unit_of(report, &holdout.signal);
         let worse = holdout.rmse_after > holdout.rmse_before;
         page.push_str(&format!(
-            "<tr><th scope=\"row\" class=\"long\">{}</th><td data-label=\"Signal\">{}</td><td class=\"n\" data-label=\"RMSE before\">{}</td><td class=\"n\" data-label=\"RMSE after\">{}</td>\
+            "<tr>{}<td data-label=\"Signal\">{}</td><td class=\"n\" data-label=\"RMSE before\">{}</td><td class=\"n\" data-label=\"RMSE after\">{}</td>\
              <td class=\"n\" data-label=\"Change\"><strong{}>{}</strong></td></tr>\n",
-            escape(&holdout.file),
+            row_head(&holdout.file),
             code(&holdout.signal),
             escape(&quantity(&significant(holdout.rmse_before, 3), unit)),
             escape(&quantity(&significant(holdout.rmse_after, 3), unit)),

@@ -46,10 +46,10 @@ pub struct Words {
 pub struct Pictures {
     /// JSON for the script.
     pub data: Data,
-    /// The signal over time.
-    pub time: Words,
-    /// The residual over time.
-    pub residual: Words,
+    /// The signal over time, if there is anything to draw.
+    pub time: Option<Words>,
+    /// The residual over time, if there is one.
+    pub residual: Option<Words>,
     /// The residual against each variable, with the variable's name.
     pub against: Vec<(String, Words)>,
     /// The spectrum, if there is one.
@@ -191,7 +191,7 @@ fn pictures_of(plots: &SignalPlots, locations: &[&Location], budget: usize) -> P
     let spectrum = spectrum(&plots.spectrum, same);
 
     Pictures {
-        time: Words {
+        time: (!values.is_empty()).then(|| Words {
             text: values
                 .iter()
                 .map(|(name, series)| range_in_words(name, series, &plots.unit))
@@ -199,8 +199,8 @@ fn pictures_of(plots: &SignalPlots, locations: &[&Location], budget: usize) -> P
                 .join("; ")
                 + ".",
             reduced: reduced.clone(),
-        },
-        residual: Words {
+        }),
+        residual: (!residuals.is_empty()).then(|| Words {
             text: residuals
                 .iter()
                 .map(|(name, series)| {
@@ -217,7 +217,7 @@ fn pictures_of(plots: &SignalPlots, locations: &[&Location], budget: usize) -> P
                 .join("; ")
                 + ".",
             reduced,
-        },
+        }),
         against: against_words,
         spectrum: spectrum.as_ref().map(|(_, words)| Words {
             text: words.text.clone(),
@@ -243,7 +243,12 @@ fn pictures_of(plots: &SignalPlots, locations: &[&Location], budget: usize) -> P
             spectrum: spectrum.map(|(data, _)| data),
             places: locations
                 .iter()
-                .filter(|location| location.kind != LocationKind::Region)
+                // Laid end to end, a recorded time is no longer one place.
+                .filter(|location| match location.kind {
+                    LocationKind::Time => timeline.anew == 0,
+                    LocationKind::Region => false,
+                    LocationKind::Frequency => true,
+                })
                 .map(|location| Place::of(location))
                 .collect(),
         },
@@ -397,7 +402,7 @@ impl Layout {
         }
         if anew > 0 {
             let end_to_end = format!(
-                "The recorded time starts anew {anew} times; the parts are laid end to end."
+                "The recorded time starts anew {anew} times; the parts are laid end to end, and places in time are not shaded."
             );
             if !words.is_empty() {
                 words.push(' ');

@@ -120,7 +120,7 @@ fn errors(report: &Report, width: usize, fullness: Fullness) -> Vec<String> {
             quantity(&significant(signal.noise_floor, 2), &signal.unit),
         ]);
     }
-    let files = fullness.entries.min(3).max(1);
+    let files = fullness.entries.clamp(1, 3);
     for holdout in report.holdouts.iter().take(files) {
         rows.push(vec![
             tail(&holdout.file, width * 3 / 8),
@@ -209,10 +209,7 @@ fn places(report: &Report, width: usize, fullness: Fullness) -> Vec<String> {
             } else {
                 place
             },
-            p_value(location.p_value)
-                .trim_start_matches("p ")
-                .trim_start_matches("= ")
-                .to_owned(),
+            p_value(location.p_value),
             location
                 .effect
                 .clone()

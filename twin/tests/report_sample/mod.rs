@@ -382,6 +382,10 @@ pub fn ambiguous() -> Report {
         "parasitic-load".to_owned(),
     ];
     effect.separated_by = "a rest of 10 min after a charge pulse".to_owned();
+    // The same effect shows in the state of charge.
+    let mut again = effect.clone();
+    again.signal = "soc_pct".to_owned();
+    report.effects.push(again);
     let mut second = report.signals[0].clone();
     second.name = "soc_pct".to_owned();
     second.unit = "%".to_owned();
