@@ -329,6 +329,20 @@ fn a_long_recording_keeps_its_peaks_and_the_page_its_size() {
     second.recorded[123_457] = 4_321.0;
     second.recorded[123_459] = -4_321.0;
     report.plots.push(second);
+    // Nothing takes more characters than a series that jumps over its whole range.
+    let mut third = report.plots[0].clone();
+    third.name = "worst".to_owned();
+    for series in [
+        &mut third.recorded,
+        &mut third.before,
+        &mut third.after,
+        &mut third.held_out_residual,
+    ] {
+        for (row, value) in series.iter_mut().enumerate() {
+            *value = 999.0 * (row as f64 * 1.7).sin() * if row % 2 == 0 { 1.0 } else { -1.0 };
+        }
+    }
+    report.plots.push(third);
     let page = html::render(&report);
     assert!(page.len() < PAGE_LIMIT, "{} bytes", page.len());
     assert!(page.contains("200,000 rows are drawn as"));
@@ -360,7 +374,7 @@ fn time_that_starts_anew_is_laid_end_to_end_and_gaps_are_not_bridged() {
         ..SignalPlots::default()
     }];
     let page = html::render(&report);
-    assert!(page.contains("starts anew 1 time"));
+    assert!(page.contains("starts anew once"));
     let data = &series(&page)[0];
     assert_eq!(
         decode(&data["t"]),

@@ -198,9 +198,13 @@ fn answer(page: &mut String, report: &Report) {
     page.push_str("<ul class=\"named\">");
     for (number, effect) in report.effects.iter().enumerate() {
         page.push_str(&format!(
-            "<li><a href=\"#effect-{number}\">{}</a>: ",
+            "<li><a href=\"#effect-{number}\">{}</a>",
             escape(&effect.id)
         ));
+        if report.signals.len() > 1 {
+            page.push_str(&format!(" in {}", code(&effect.signal)));
+        }
+        page.push_str(": ");
         let parameters: Vec<String> = effect.parameters.iter().map(in_words).collect();
         page.push_str(&escape(&parameters.join(", ")));
         if !effect.equivalent_to.is_empty() {
@@ -292,7 +296,7 @@ fn effects(page: &mut String, report: &Report) {
         page.push_str(if report.verdict == Verdict::NoMismatch {
             "<p>None is needed.</p>\n"
         } else {
-            "<p>None is named: no effect of the library held on samples that were not fitted, and beat its placebos.</p>\n"
+            "<p>None is named: no effect of the library both held on samples that were not fitted and beat its placebos.</p>\n"
         });
     }
     for (number, effect) in report.effects.iter().enumerate() {

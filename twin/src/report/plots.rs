@@ -9,8 +9,8 @@ use serde::Serialize;
 
 use super::data::{Location, LocationKind, Report, SignalPlots};
 
-/// Values that one page holds over all signals; at 9 characters or less each they stay below 4 MB.
-pub const VALUES_PER_PAGE: usize = 400_000;
+/// Values that one page holds over all signals; at some 5 to 9 characters each they stay below 4.5 MB.
+pub const VALUES_PER_PAGE: usize = 500_000;
 /// Samples drawn in one picture of the residual against a variable, at most, beside the extremes.
 const POINTS: usize = 2_400;
 /// Columns of which the extremes are drawn in any case.
@@ -401,8 +401,12 @@ impl Layout {
             );
         }
         if anew > 0 {
+            let times = match anew {
+                1 => "once".to_owned(),
+                _ => format!("{anew} times"),
+            };
             let end_to_end = format!(
-                "The recorded time starts anew {anew} times; the parts are laid end to end, and places in time are not shaded."
+                "The recorded time starts anew {times}; the parts are laid end to end, and places in time are not shaded."
             );
             if !words.is_empty() {
                 words.push(' ');
