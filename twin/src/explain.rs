@@ -378,6 +378,7 @@ fn effects(bench: &Workbench<'_>, selection: &Selection, seed: u64) -> Vec<Effec
                     value: member.values[p],
                     ci95: intervals[named.index][p],
                     unit: unit(bench.problem, parameter.unit),
+                    off: parameter.off.is_finite().then_some(parameter.off),
                 })
                 .collect();
             let separated: Vec<&str> = named
