@@ -63,6 +63,10 @@ pub struct Inputs {
     pub recording: String,
     /// Separate reference, if one was given.
     pub reference: Option<String>,
+    /// Folder that report and extended model are written to, as named by the user; not part of report.json, so that two
+    /// runs of the same input write the same file wherever they write it.
+    #[serde(skip)]
+    pub out: Option<String>,
 }
 
 /// One signal, before and after.
@@ -134,6 +138,9 @@ pub struct ParameterReport {
     pub ci95: [f64; 2],
     /// Unit.
     pub unit: String,
+    /// The value that turns the effect off, if a finite one does.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub off: Option<f64>,
 }
 
 /// A named effect.
