@@ -13,3 +13,4 @@ pub mod problem;
 pub mod progress;
 pub mod report;
 pub mod simulate;
+pub mod spectrum;

@@ -81,6 +81,8 @@ pub struct SensorBase {
     pub step: f64,
     /// Full scale, in the view's unit, if stated.
     pub full_scale: Option<f64>,
+    /// Full scale of the large range over that of the small one; 0 if there is one range.
+    pub range_ratio: f64,
     /// Where the small range ends by design, in the view's unit, if there are two.
     pub range_limit: Option<f64>,
     /// True if the reference stays at its value until its next row instead of going there in a straight line.
@@ -155,7 +157,11 @@ impl Drive {
         let mut steps: Vec<f64> = self
             .segments
             .iter()
-            .flat_map(|rows| self.t_s[rows.clone()].windows(2).map(|pair| pair[1] - pair[0]))
+            .flat_map(|rows| {
+                self.t_s[rows.clone()]
+                    .windows(2)
+                    .map(|pair| pair[1] - pair[0])
+            })
             .filter(|step| *step > 0.0)
             .collect();
         if steps.is_empty() {

@@ -49,9 +49,23 @@ pub struct Report {
     pub version: String,
     /// Input files, as named by the user.
     pub inputs: Inputs,
+    /// The fitted models, for the extended model file; not part of report.json.
+    #[serde(skip)]
+    pub models: Vec<FittedModel>,
     /// What the pictures are drawn from; not part of report.json.
     #[serde(skip)]
     pub plots: Vec<SignalPlots>,
+}
+
+/// What was fitted to one signal.
+#[derive(Clone, Debug, Default)]
+pub struct FittedModel {
+    /// Column of the signal.
+    pub signal: String,
+    /// Effects: id, and the value of every parameter with its name (internal ones too).
+    pub effects: Vec<(String, Vec<(String, f64)>)>,
+    /// What the base differs by, within what the model file says it does not know.
+    pub nuisance: crate::effects::chain::Nuisance,
 }
 
 /// The files that the report is about.
