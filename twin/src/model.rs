@@ -15,10 +15,10 @@ use std::{
 use recording::csv;
 use serde::Deserialize;
 
-pub use extended::Found;
+pub use extended::{Found, Shift};
 use place::Places;
 
-use crate::failure::Failure;
+use crate::{effects::Parameter, failure::Failure};
 
 /// Version of the format.
 pub const SCHEMA: u32 = 1;
@@ -241,8 +241,11 @@ impl Model {
             return Err(places.fault(&[], "neither [sensor] nor [battery]", "at least one of them"));
         }
         let mut effects = Vec::new();
-        for (id, values) in &parsed.effects {
-            effects.push(modelled(id, values, &places)?);
+        // In the order of the file: a gain after an offset is not an offset after a gain.
+        for id in places.order("effects") {
+            if let Some(values) = parsed.effects.get(&id) {
+                effects.push(modelled(&id, values, &places)?);
+            }
         }
         Ok(Self {
             source: source.to_owned(),
@@ -263,8 +266,24 @@ impl Model {
 
     /// The model file with effects added, and otherwise as its user wrote it. An effect that it already has gets the
     /// new values.
-    pub fn extended(&self, effects: &[Found]) -> Result<String, Failure> {
-        extended::extended(&self.source, &self.text, effects)
+    ///
+    /// `from` is the folder of this model file and `to` the one of the new file: an `ocv_file` is named anew.
+    pub fn extended(
+        &self,
+        effects: &[Found],
+        shift: Shift,
+        from: &Path,
+        to: &Path,
+    ) -> Result<String, Failure> {
+        extended::Extension {
+            source: &self.source,
+            battery: self.battery.as_ref(),
+            effects,
+            shift,
+            from,
+            to,
+        }
+        .write(&self.text)
     }
 }
 
@@ -471,23 +490,37 @@ fn modelled(
         let known = registry::ids().join(", ");
         return Err(places.fault(&["effects", id], "an unknown effect", &format!("one of {known}")));
     };
-    let fitting = variants
-        .iter()
-        .find(|names| names.len() == values.len() && names.iter().all(|name| values.contains_key(*name)));
-    let Some(names) = fitting else {
-        let known: Vec<String> = variants.iter().map(|names| names.join(", ")).collect();
-        let all = variants.last().map(Vec::as_slice).unwrap_or_default();
-        let wrong = values.keys().find(|key| !all.contains(&key.as_str()));
-        let (found, path) = match wrong {
-            Some(key) => (format!("an unknown parameter {key}"), vec!["effects", id, key.as_str()]),
-            None => ("not all parameters".to_owned(), vec!["effects", id]),
-        };
-        return Err(places.fault(&path, &found, &known.join("; or ")));
+    // An internal parameter (a phase) may be left out.
+    let fits = |parameters: &&&[Parameter]| {
+        let known = |key: &String| parameters.iter().any(|parameter| parameter.name == key);
+        let complete = parameters
+            .iter()
+            .all(|parameter| parameter.internal || values.contains_key(parameter.name));
+        complete && values.keys().all(known)
     };
-    let ordered: Vec<f64> = names.iter().filter_map(|name| values.get(*name).copied()).collect();
-    if let Some((name, value)) = names.iter().zip(&ordered).find(|(_, value)| !value.is_finite()) {
-        // Infinity switches clipping off, and is then better left out.
-        return Err(places.fault(&["effects", id, name], &value.to_string(), "a finite number"));
+    let Some(parameters) = variants.iter().find(fits) else {
+        let names = |parameters: &&[Parameter]| {
+            let names: Vec<&str> = parameters.iter().map(|parameter| parameter.name).collect();
+            names.join(", ")
+        };
+        let known: Vec<String> = variants.iter().map(names).collect();
+        let all = variants.last().copied().unwrap_or_default();
+        let wrong = values
+            .keys()
+            .find(|key| all.iter().all(|parameter| parameter.name != key.as_str()));
+        let (found, path) = match wrong {
+            Some(key) => ("an unknown parameter", vec!["effects", id, key.as_str()]),
+            None => ("not all parameters", vec!["effects", id]),
+        };
+        return Err(places.fault(&path, found, &known.join("; or ")));
+    };
+    let mut ordered = Vec::new();
+    for parameter in parameters.iter() {
+        let value = values.get(parameter.name).copied().unwrap_or(parameter.off);
+        if value.is_nan() {
+            return Err(places.fault(&["effects", id, parameter.name], "nan", "a number"));
+        }
+        ordered.push(value);
     }
     Ok((id, ordered))
 }

@@ -308,7 +308,7 @@ impl Board {
         let mut meter = MeterChannel::new(self.configuration.meter);
         let mut edges = EdgeRecorder::new(instant(start_s), first.range == SensorRange::Large);
         let mut walk = Walk::new(pieces);
-        let mut read = |meter: &mut MeterChannel, edges: &EdgeRecorder, counted_s: f64, at_s: f64| {
+        let read = |meter: &mut MeterChannel, edges: &EdgeRecorder, counted_s: f64, at_s: f64| {
             let counts = (counted_s * per_s).floor() as i64;
             let energy = (((counts.rem_euclid(1 << 24)) as i32) << 8) >> 8;
             let at = instant(at_s);
