@@ -5,14 +5,17 @@
 //! 3. Fine: least squares over offset, rate and a smoothing of the reference (a first-order lag or a moving average,
 //!    whichever fits better), with gain and zero solved within. Without the smoothing a lag would be taken for a shift.
 
-/// Points of the coarse grid.
-const GRID: usize = 4096;
+/// Points of the coarse grids: on a fine one the noise between two points hides a slow sensor, on a coarse one a fast
+/// sensor's edges are lost. The one on which the signals are most alike counts.
+const GRIDS: [usize; 4] = [4096, 1024, 256, 64];
 /// Share of the shorter signal that has to overlap.
 const LEAST_OVERLAP: f64 = 0.25;
 /// Correlation of the derivatives below which nothing was found, …
 const LEAST_CORRELATION: f64 = 0.2;
 /// … unless it stands out by this many times the rms over all offsets.
 const STANDS_OUT: f64 = 6.0;
+/// Correlation of the values themselves that is no chance among thousands of offsets.
+const SCAN_CORRELATION: f64 = 0.6;
 /// Fastest clock error that is looked for, in 1: crystals are within 100 ppm, cheap loggers within 500.
 const FASTEST_RATE: f64 = 500e-6;
 /// Readings that the fine fit uses at most.
@@ -111,7 +114,6 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
             sensed.t_s.len()
         ));
     }
-    let (coarse_s, grid_s) = coarse(driven, sensed)?;
     let thin = thinned(sensed);
     let spread = spread(&thin.value).max(f64::MIN_POSITIVE);
     let fit = Fit {
@@ -122,6 +124,9 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
         huber: HUBER_SHARE * spread,
     };
     let step_s = thin.step_s().max(driven.step_s()).max(1e-9);
+    let (coarse_s, grid_s) = coarse(driven, sensed)
+        .or_else(|| fit.scan(step_s))
+        .ok_or_else(|| nothing_in_common(driven, sensed))?;
     // Smoothing and offset by trial; the rate is still unknown, so only its middle matters.
     let mut best = Trial::worst();
     for shape in [Shape::Lag, Shape::Average] {
@@ -187,10 +192,23 @@ fn nothing_in_common(driven: &Signal, sensed: &Signal) -> String {
 }
 
 /// Offset of the highest correlation of the derivatives, and the grid's step.
-fn coarse(driven: &Signal, sensed: &Signal) -> Result<(f64, f64), String> {
+fn coarse(driven: &Signal, sensed: &Signal) -> Option<(f64, f64)> {
     let longest_s = driven.span_s().max(sensed.span_s());
     let finest_s = driven.step_s().min(sensed.step_s());
-    let grid_s = (longest_s / GRID as f64).max(finest_s).max(1e-9);
+    let mut best: Option<(f64, f64, f64)> = None;
+    for grid in GRIDS {
+        let grid_s = (longest_s / grid as f64).max(finest_s).max(1e-9);
+        if let Some((score, offset_s)) = correlate(driven, sensed, grid_s)
+            && best.is_none_or(|(known, ..)| score > known)
+        {
+            best = Some((score, offset_s, grid_s));
+        }
+    }
+    best.map(|(_, offset_s, grid_s)| (offset_s, grid_s))
+}
+
+/// The highest correlation of the derivatives on one grid and its offset; `None` if it does not stand out.
+fn correlate(driven: &Signal, sensed: &Signal, grid_s: f64) -> Option<(f64, f64)> {
     let x = derivative(driven, grid_s);
     let y = derivative(sensed, grid_s);
     let shorter = x.len().min(y.len());
@@ -205,7 +223,7 @@ fn coarse(driven: &Signal, sensed: &Signal) -> Result<(f64, f64), String> {
         all
     };
     let (squares_x, squares_y) = (squares(&x), squares(&y));
-    let (mut best, mut best_lag, mut total, mut count) = (0.0_f64, 0_isize, 0.0, 0);
+    let mut scores = Vec::new();
     // y[k] beside x[k + lag].
     let (first, last) = (-(y.len() as isize), x.len() as isize);
     for lag in first..=last {
@@ -227,19 +245,21 @@ fn coarse(driven: &Signal, sensed: &Signal) -> Result<(f64, f64), String> {
         }
         // Among equals (a periodic load) the one that most of both takes part in.
         let share = (length as f64 / shorter as f64).min(1.0).sqrt();
-        let score = product / energy.sqrt() * share;
-        total += score * score;
-        count += 1;
-        if score.abs() > best.abs() {
-            (best, best_lag) = (score, lag);
-        }
+        scores.push((product / energy.sqrt() * share, lag));
     }
-    let rms = (total / f64::from(count.max(1))).sqrt();
-    if best.abs() < LEAST_CORRELATION && best.abs() < STANDS_OUT * rms {
-        return Err(nothing_in_common(driven, sensed));
+    let (best, lag) = scores
+        .iter()
+        .copied()
+        .max_by(|one, other| one.0.abs().total_cmp(&other.0.abs()))?;
+    let total: f64 = scores.iter().map(|(score, _)| score * score).sum();
+    let rms = (total / scores.len() as f64).sqrt();
+    // Chance alone reaches about 1/√n, and the largest of many tries some times that.
+    let chance = STANDS_OUT / (shorter as f64).sqrt();
+    if best.abs() < LEAST_CORRELATION.max(chance.min(0.7)) && best.abs() < STANDS_OUT * rms {
+        return None;
     }
     let origin = |signal: &Signal| signal.t_s.first().copied().unwrap_or(0.0);
-    Ok((origin(driven) - origin(sensed) + best_lag as f64 * grid_s, grid_s))
+    Some((best.abs(), origin(driven) - origin(sensed) + lag as f64 * grid_s))
 }
 
 /// Differences of the means over the cells of a grid that begins at the first row.
@@ -435,6 +455,38 @@ impl Fit<'_> {
             };
         });
         cost / sums.count
+    }
+
+    /// Every offset, tried on the values themselves: for a sensor so slow beside its load that it has no edges in common
+    /// with it. The offset and how far apart the tries were; `None` if none stands out.
+    fn scan(&self, step_s: f64) -> Option<(f64, f64)> {
+        let driven_s = self.driven.t_s.first().copied()?;
+        let span_s = self.driven.span_s();
+        let apart_s = (step_s / 20.0).max(self.driven.step_s()).max((span_s + self.span_s) / 20_000.0);
+        let rows = self.sensed.t_s.len();
+        if rows > 2000 {
+            // That many readings have edges.
+            return None;
+        }
+        let (mut best, mut best_s) = (0.0_f64, 0.0);
+        for window_s in [0.1, 0.25, 0.5, 1.0].map(|share| share * step_s) {
+            let smooth = self.smooth(Shape::Average, window_s);
+            let first_s = driven_s - self.start_s - (1.0 - LEAST_OVERLAP) * self.span_s;
+            let tries = ((span_s + (1.0 - 2.0 * LEAST_OVERLAP) * self.span_s) / apart_s).ceil().max(0.0) as usize;
+            for index in 0..=tries {
+                let offset_s = first_s + index as f64 * apart_s;
+                let sums = self.sums(&smooth, offset_s, 0.0, self.all());
+                if sums.count < LEAST_OVERLAP * rows as f64 {
+                    continue;
+                }
+                // Among equals (a periodic load) the one that most readings take part in.
+                let score = sums.correlation() * (sums.count / rows as f64).sqrt();
+                if score.abs() > best.abs() {
+                    (best, best_s) = (score, offset_s);
+                }
+            }
+        }
+        (best.abs() > SCAN_CORRELATION).then_some((best_s, apart_s))
     }
 
     /// Offset at the start and drift from the best offsets of several blocks.

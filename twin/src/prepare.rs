@@ -182,7 +182,13 @@ impl Work<'_> {
         }
         let board = Board::new(sensor.front_end, sensor.average.unwrap_or(1));
         let fresh = match &value {
-            Some(value) => freshness(self.frame, &found, value, self.reference.is_none()),
+            Some(value) => freshness(
+                self.frame,
+                &found,
+                value,
+                self.reference.is_none(),
+                sensor.interval_s,
+            ),
             None => Freshness::all(self.frame.t_s().len()),
         };
         if let Some(interval_s) = fresh.interval_s {

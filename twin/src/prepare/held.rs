@@ -30,9 +30,17 @@ impl Freshness {
 /// Decides it for one column. `beside` says that the reference has the same rows; without one, changes of the value
 /// have to tell.
 ///
+/// `stated_s` is the time between two new readings by design, 0 if nothing is stated.
+///
 /// A sensor that repeats itself at its highest or lowest value, or at one value above all (zero), does not hold: that is
 /// clipping or a dead band.
-pub fn freshness(frame: &Frame, reference: &[f64], value: &[f64], beside: bool) -> Freshness {
+pub fn freshness(
+    frame: &Frame,
+    reference: &[f64],
+    value: &[f64],
+    beside: bool,
+    stated_s: f64,
+) -> Freshness {
     let t_s = frame.t_s();
     let rows = value.len();
     // Pairs of successive readings of one clock.
@@ -75,7 +83,10 @@ pub fn freshness(frame: &Frame, reference: &[f64], value: &[f64], beside: bool) 
         moved += 1;
         repeated += usize::from(value[*before] == value[*after]);
     }
-    if moved < 10 || (repeated as f64) < HELD_SHARE * moved as f64 {
+    let mut apart: Vec<f64> = pairs.iter().map(|(before, after)| t_s[*after] - t_s[*before]).collect();
+    let is_stated = median(&mut apart).is_some_and(|step_s| step_s < 0.75 * stated_s);
+    let is_seen = moved >= 10 && repeated as f64 >= HELD_SHARE * moved as f64;
+    if !is_stated && !is_seen {
         return Freshness::all(rows);
     }
     // Time between changes where the reference moved, so that a rest does not look like a slow sensor.
@@ -97,7 +108,11 @@ pub fn freshness(frame: &Frame, reference: &[f64], value: &[f64], beside: bool) 
             last_change = Some(t_s[*after]);
         }
     }
-    let interval_s = median(&mut spans).unwrap_or(0.0);
+    let interval_s = if is_stated {
+        stated_s
+    } else {
+        median(&mut spans).unwrap_or(0.0)
+    };
     // A value that stays longer was measured again and came out the same: once for each interval.
     let mut last_fresh = f64::NEG_INFINITY;
     before_row = usize::MAX;
