@@ -377,6 +377,7 @@ fn effects(bench: &Workbench<'_>, selection: &Selection, seed: u64) -> Vec<Effec
                     name: parameter.name.to_owned(),
                     value: member.values[p],
                     ci95: intervals[named.index][p],
+                    off: Some(parameter.off).filter(|off| off.is_finite()),
                     unit: unit(bench.problem, parameter.unit),
                     off: parameter.off.is_finite().then_some(parameter.off),
                 })

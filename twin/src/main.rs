@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use twin::{convert, failure::Failure};
+use twin::{convert, effects_command, explain_command, failure::Failure, simulate};
 
 /// Explains why a recording and the simulation disagree.
 #[derive(Debug, Parser)]
@@ -15,7 +15,10 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Simulate(simulate::command::Arguments),
+    Explain(explain_command::Arguments),
     Convert(convert::Arguments),
+    Effects(effects_command::Arguments),
 }
 
 fn main() -> ExitCode {
@@ -36,6 +39,9 @@ fn main() -> ExitCode {
 
 fn run(command: &Command) -> Result<String, Failure> {
     match command {
+        Command::Simulate(arguments) => simulate::command::run(arguments),
+        Command::Explain(arguments) => explain_command::run(arguments),
         Command::Convert(arguments) => convert::run(arguments),
+        Command::Effects(arguments) => Ok(effects_command::run(arguments)),
     }
 }
