@@ -9,6 +9,9 @@ pub const REFERENCE_C: f64 = 25.0;
 /// 0 °C in K.
 pub const ZERO_CELSIUS_K: f64 = 273.15;
 
+/// Steps whose exponentials are kept.
+const KNOWN: usize = 16;
+
 /// What sizes are natural in a problem: bounds and starts follow from it.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Scale {
@@ -96,20 +99,23 @@ pub fn low_pass(
     if !(tau_s > 0.0) {
         return output;
     }
+    // Steps repeat, with some jitter: an exponential for each row would be most of the time.
+    let mut known = [(f64::NAN, 0.0, 0.0); KNOWN];
     for rows in segments {
-        let mut known = (f64::NAN, 0.0, 0.0);
         for row in rows.clone().skip(1) {
             let h = t_s[row] - t_s[row - 1];
             if h <= 0.0 {
                 output[row] = output[row - 1];
                 continue;
             }
-            // Steps repeat: an exponential for each row would be most of the time.
-            if known.0 != h {
+            // To a nanosecond: differences of times carry rounding.
+            let nanos = (h * 1e9).round();
+            let slot = &mut known[(nanos as u64 / 1_000_000) as usize % KNOWN];
+            if slot.0 != nanos {
                 let kept = (-h / tau_s).exp();
-                known = (h, kept, 1.0 - tau_s / h * (1.0 - kept));
+                *slot = (nanos, kept, 1.0 - tau_s / h * (1.0 - kept));
             }
-            let (_, kept, ramp) = known;
+            let (_, kept, ramp) = *slot;
             let from = input[row - 1];
             let rise = if held { 0.0 } else { input[row] - from };
             output[row] = kept * output[row - 1] + (1.0 - kept) * from + rise * ramp;

@@ -286,13 +286,17 @@ fn placebos(
         .into_par_iter()
         .map(|this| {
             let moved = turned(residual, this.by, this.reversed);
+            // A residual that is much the same when it is moved (one pulse, a constant) is a placebo for nothing.
+            let same = dot(residual, &moved).abs() > ITSELF * dot(residual, residual);
             entries
                 .iter()
                 .map(|entry| {
-                    let itself = entry.columns.iter().any(|column| {
-                        let size = dot(column, column);
-                        (dot(column, &turned(column, this.by, this.reversed)) / size).abs() > ITSELF
-                    });
+                    let itself = same
+                        || entry.columns.iter().any(|column| {
+                            let size = dot(column, column);
+                            (dot(column, &turned(column, this.by, this.reversed)) / size).abs()
+                                > ITSELF
+                        });
                     if itself {
                         flipped(entry, residual, blocks, &this.signs)
                     } else {

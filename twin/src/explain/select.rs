@@ -2,15 +2,17 @@
 
 use rayon::prelude::*;
 
-use super::fit::{Fit, fit, held_out, huber};
+use super::fit::{Fit, fit, held_out, huber, polish};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
 use super::workbench::{Member, Model, Workbench};
-use crate::effects::{Effect, Search, find};
+use crate::effects::{Effect, Search, Stage, find};
 
 /// Effects in one model at most.
 const MOST_EFFECTS: usize = 6;
 /// Candidates that are fitted after screening.
 const FITTED: usize = 8;
+/// First effects of pairs, and second ones of each.
+const FIRSTS: usize = 5;
 /// Starts of each that are fitted.
 const STARTS: usize = 2;
 /// A named effect takes away at least this share of the held-out squared error (2 % of the held-out rms), overall or where it
@@ -18,6 +20,10 @@ const STARTS: usize = 2;
 const FLOOR: f64 = 0.04;
 /// Rows where an effect changes the reading by at least this share of its largest change are where it acts.
 const ACTS: f64 = 0.2;
+/// Share of the held-out error from which on a single effect is clear by itself.
+const CLEAR: f64 = 0.97;
+/// Share of what the best single effect leaves that a pair has to take to be preferred.
+const MUCH: f64 = 0.3;
 /// So many others that would do as well make an effect nameless if it is small.
 const VAGUE: usize = 3;
 /// Share of the held-out error below which an effect is small.
@@ -85,9 +91,21 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                 "trying every effect of the library",
             );
             let screening = screen(bench, &now, seed.wrapping_add(done as u64), DRAWS);
-            let Some((better, p99)) = step(bench, &now, &screening, &mut decisions, &mut refused)
-                .or_else(|| pair(bench, &now, &screening, &mut decisions))
-            else {
+            let single = step(bench, &now, &screening, &mut decisions, &mut refused);
+            // Where two effects hide each other, the best single one can be the wrong one: pairs are tried at the beginning, and
+            // whenever nothing passes alone.
+            let double = if now.model.members.is_empty() || single.is_none() {
+                pair(
+                    bench,
+                    &now,
+                    &screening,
+                    single.as_ref().map(|(fit, _)| fit),
+                    &mut decisions,
+                )
+            } else {
+                None
+            };
+            let Some((better, p99)) = double.or(single) else {
                 break;
             };
             for id in better.model.ids() {
@@ -111,6 +129,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
             Some(better) if rounds < 3 => now = better,
             _ => {
                 progress(0.92, "asking which other effects would do as well");
+                let now = polish(bench, &now);
                 let named = name(bench, &now, &others, &step_p99);
                 // Small, and as well explained by many others: that is structure, and no name.
                 let Some(vague) = named
@@ -282,6 +301,10 @@ fn obstacle(
             percent(FLOOR)
         ));
     }
+    let noise = to / rows;
+    if card.stage == Stage::Output && changed / rows < noise {
+        return Some("smaller than the noise where it acts".into());
+    }
     if changed < accuracy {
         return Some(format!(
             "its size, {:.3} rms, is within the reference's own accuracy, {:.3}",
@@ -331,31 +354,25 @@ fn pair(
     bench: &Workbench<'_>,
     now: &Fit,
     screening: &Screening,
+    single: Option<&Fit>,
     decisions: &mut Vec<String>,
 ) -> Option<(Fit, f64)> {
+    // What one effect explains so well needs no second one to be found.
+    if single.is_some_and(|single| share(bench, now, single) > CLEAR) {
+        return None;
+    }
     if now.model.members.len() + 2 > MOST_EFFECTS {
         return None;
     }
-    let mut tops: Vec<&Entry> = Vec::new();
-    for entry in &screening.entries {
-        if tops.len() < FITTED && !tops.iter().any(|top| top.member.id() == entry.member.id()) {
-            tops.push(entry);
-        }
-    }
-    let mut pairs = Vec::new();
-    for (k, one) in tops.iter().enumerate() {
-        for other in &tops[..k] {
-            pairs.push((one.member.clone(), other.member.clone()));
-        }
-    }
-    let fits: Vec<Fit> = pairs
-        .into_par_iter()
-        .map(|(one, other)| {
-            let model = replaced(&replaced(&now.model, one.effect), other.effect)
-                .with(one)
-                .with(other);
-            fit(bench, &model, None)
+    // A masked effect shows once the other is fitted: from each of the best single ones one goes a step further.
+    let firsts = fits(bench, now, &screening.entries, FIRSTS, 1);
+    let fits: Vec<Fit> = firsts
+        .iter()
+        .flat_map(|(first, _)| {
+            let next = screen(bench, first, 0, 0);
+            fits(bench, first, &next.entries, FIRSTS, 1)
         })
+        .map(|(fit, _)| fit)
         .collect();
     let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
     let best = fits
@@ -368,7 +385,12 @@ fn pair(
         .0;
     let count = best.model.members.len();
     let gain = share(bench, now, &best);
-    if gain <= 2.0 * screening.placebo_p99 || gain < FLOOR {
+    // Two effects may each gain what a placebo gains.
+    let chance = 1.0 - (1.0 - screening.placebo_p99.min(1.0)).powi(2);
+    if gain <= chance || gain < FLOOR {
+        return None;
+    }
+    if single.is_some_and(|single| share(bench, single, &best) < MUCH) {
         return None;
     }
     // Each of the two has to be missed.
@@ -383,7 +405,7 @@ fn pair(
     }
     let ids = best.model.ids();
     decisions.push(format!(
-        "{} and {} added together: neither passes alone, both take {} of the held-out error.",
+        "{} and {} added together: both take {} of the held-out error, more than any one alone and than placebos.",
         ids[count - 2],
         ids[count - 1],
         percent(gain)
