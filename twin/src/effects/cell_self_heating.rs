@@ -1,7 +1,7 @@
 //! The cell warms itself.
 
-use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, polarisation::from_rest, spaced};
+use super::scene::{Scale, Scene, ladder};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
 /// Arrhenius temperature of the resistance where nothing says what it is: that of usual lithium-ion cells, 1500 … 4000 K.
@@ -56,7 +56,7 @@ impl Effect for CellSelfHeating {
         };
         let ohms = battery.base.resistance_ohm;
         let losses: Vec<f64> = scene.signal.iter().map(|i| ohms * i * i).collect();
-        let heat = from_rest(&drive.t_s, &drive.segments, &losses, values[1]);
+        let heat = ladder(&drive.t_s, &drive.segments, &losses, [values[1]], [1.0]);
         battery
             .temperature_c
             .iter_mut()

@@ -1,11 +1,11 @@
 //! Solid diffusion.
 
-use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, polarisation::from_rest, spaced};
+use super::scene::{Scale, Scene, ladder};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
 /// Terms of the series that are calculated.
-const TERMS: u32 = 8;
+const TERMS: usize = 8;
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -61,19 +61,23 @@ impl Effect for Diffusion {
             .zip(&battery.factor)
             .map(|(i, factor)| i * factor)
             .collect();
-        let mut left = ohms;
-        for term in 0..TERMS {
-            // Poles at ((k − ½)·π)².
-            let pole = ((f64::from(term) + 0.5) * std::f64::consts::PI).powi(2);
-            let share = ohms * 2.0 / pole;
-            left -= share;
-            let branch = from_rest(&drive.t_s, &drive.segments, &driven, tau / pole);
-            battery
-                .added_v
-                .iter_mut()
-                .zip(branch)
-                .for_each(|(added, i)| *added -= share * i);
-        }
+        // Poles at ((k − ½)·π)².
+        let poles: [f64; TERMS] =
+            std::array::from_fn(|k| ((k as f64 + 0.5) * std::f64::consts::PI).powi(2));
+        let weights = poles.map(|pole| ohms * 2.0 / pole);
+        let left = ohms - weights.iter().sum::<f64>();
+        let slow = ladder(
+            &drive.t_s,
+            &drive.segments,
+            &driven,
+            poles.map(|pole| tau / pole),
+            weights,
+        );
+        battery
+            .added_v
+            .iter_mut()
+            .zip(slow)
+            .for_each(|(added, v)| *added -= v);
         // What the terms leave out acts at once.
         battery
             .added_v

@@ -1,8 +1,6 @@
 //! RC branches after the ohmic step.
 
-use std::ops::Range;
-
-use super::scene::{Scale, Scene, low_pass};
+use super::scene::{Scale, Scene, ladder};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
@@ -89,28 +87,19 @@ impl Effect for Polarisation {
             .zip(&battery.factor)
             .map(|(i, factor)| i * factor)
             .collect();
-        for branch in values.chunks_exact(2) {
-            let through = from_rest(&drive.t_s, &drive.segments, &driven, branch[1]);
-            battery
-                .added_v
-                .iter_mut()
-                .zip(through)
-                .for_each(|(added, i)| *added -= branch[0] * i);
-        }
-    }
-}
-
-/// A low-pass that is at rest when a segment begins.
-pub fn from_rest(t_s: &[f64], segments: &[Range<usize>], input: &[f64], tau_s: f64) -> Vec<f64> {
-    let mut output = low_pass(t_s, segments, input, tau_s, false);
-    // Linear: the response to the first value, which the low-pass takes as having stood for ever, is taken away.
-    for rows in segments.iter().filter(|rows| !rows.is_empty()) {
-        let first = input[rows.start];
-        if first != 0.0 && tau_s > 0.0 {
-            for row in rows.clone() {
-                output[row] -= first * (-(t_s[row] - t_s[rows.start]) / tau_s).exp();
+        let (t_s, segments) = (&drive.t_s, &drive.segments);
+        let v = match *values {
+            [r1, tau1] => ladder(t_s, segments, &driven, [tau1], [r1]),
+            [r1, tau1, r2, tau2] => ladder(t_s, segments, &driven, [tau1, tau2], [r1, r2]),
+            [r1, tau1, r2, tau2, r3, tau3] => {
+                ladder(t_s, segments, &driven, [tau1, tau2, tau3], [r1, r2, r3])
             }
-        }
+            _ => return,
+        };
+        battery
+            .added_v
+            .iter_mut()
+            .zip(v)
+            .for_each(|(added, v)| *added -= v);
     }
-    output
 }

@@ -101,11 +101,13 @@ pub fn low_pass(
     }
     // Steps repeat, with some jitter: an exponential for each row would be most of the time.
     let mut known = [(f64::NAN, 0.0, 0.0); KNOWN];
-    for rows in segments {
-        for row in rows.clone().skip(1) {
+    for rows in segments.iter().filter(|rows| !rows.is_empty()) {
+        let mut last = input[rows.start];
+        output[rows.start] = last;
+        for row in rows.start + 1..rows.end {
             let h = t_s[row] - t_s[row - 1];
             if h <= 0.0 {
-                output[row] = output[row - 1];
+                output[row] = last;
                 continue;
             }
             // To a nanosecond: differences of times carry rounding.
@@ -118,7 +120,48 @@ pub fn low_pass(
             let (_, kept, ramp) = *slot;
             let from = input[row - 1];
             let rise = if held { 0.0 } else { input[row] - from };
-            output[row] = kept * output[row - 1] + (1.0 - kept) * from + rise * ramp;
+            last = kept * last + (1.0 - kept) * from + rise * ramp;
+            output[row] = last;
+        }
+    }
+    output
+}
+
+/// A sum of first-order low-passes of one input, each with a weight, all at rest when a segment begins: one pass over the rows.
+pub fn ladder<const N: usize>(
+    t_s: &[f64],
+    segments: &[Range<usize>],
+    input: &[f64],
+    taus_s: [f64; N],
+    weights: [f64; N],
+) -> Vec<f64> {
+    let mut output = vec![0.0; input.len()];
+    let mut known = [(f64::NAN, [0.0; N], [0.0; N]); KNOWN];
+    for rows in segments.iter().filter(|rows| !rows.is_empty()) {
+        let mut last = [0.0; N];
+        for row in rows.start + 1..rows.end {
+            let h = t_s[row] - t_s[row - 1];
+            if h > 0.0 {
+                let nanos = (h * 1e9).round();
+                let slot = &mut known[(nanos as u64 / 1_000_000) as usize % KNOWN];
+                if slot.0 != nanos {
+                    slot.0 = nanos;
+                    for k in 0..N {
+                        let kept = (-h / taus_s[k]).exp();
+                        slot.1[k] = kept;
+                        slot.2[k] = 1.0 - taus_s[k] / h * (1.0 - kept);
+                    }
+                }
+                let (from, rise) = (input[row - 1], input[row] - input[row - 1]);
+                for k in 0..N {
+                    last[k] = slot.1[k] * (last[k] - from) + from + rise * slot.2[k];
+                }
+            }
+            let mut sum = 0.0;
+            for k in 0..N {
+                sum += weights[k] * last[k];
+            }
+            output[row] = sum;
         }
     }
     output

@@ -11,9 +11,9 @@ pub const TUNING: f64 = 3.0;
 /// Steps of Levenberg–Marquardt in one go.
 const STEPS: usize = 14;
 /// A step that lowers the loss by a smaller share calls for a new slope.
-const SLOW: f64 = 1e-2;
+const SLOW: f64 = 5e-3;
 /// A step with a new slope that lowers the loss by a smaller share is the last.
-const ENOUGH: f64 = 1e-5;
+const ENOUGH: f64 = 1e-4;
 
 /// A fitted model.
 #[derive(Clone, Debug)]
