@@ -79,6 +79,8 @@ pub struct SensorBase {
     pub window_s: f64,
     /// The converter's step by design, in the view's unit; 0: continuous.
     pub step: f64,
+    /// Time by which readings stand for an earlier moment than their row, within half a step; found with an effect, 0 by design.
+    pub alignment_s: f64,
     /// Full scale, in the view's unit, if stated.
     pub full_scale: Option<f64>,
     /// Full scale of the large range over that of the small one; 0 if there is one range.

@@ -69,6 +69,9 @@ impl<'a> Chain<'a> {
             }
         };
         scene.delay_s = nuisance.alignment_s;
+        if let Base::Sensor(base) = &problem.base {
+            scene.delay_s += base.alignment_s;
+        }
         match &problem.base {
             Base::Sensor(base) => {
                 apply_through(&mut scene, Stage::Filter);

@@ -410,6 +410,9 @@ fn cost(
 /// Fits every free value from where the model stands. `used` weighs rows (0: left out); sigma is found on the way.
 pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
     let mut model = model.clone();
+    if !bench.aligns(&model) {
+        model.nuisance.alignment_s = 0.0;
+    }
     let mut predicted = bench.run(&model);
     let mut residual = bench.residual(&predicted);
     let mut sigma = spread(&residual);
