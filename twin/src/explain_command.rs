@@ -226,8 +226,7 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
             });
         }
         if !found.is_empty() {
-            let nuisance = fitted.nuisance;
-            shift.take(nuisance.soc_shift, nuisance.resistance);
+            shift.take(fitted.nuisance);
         }
     }
     model.extended(&found, shift, file.parent().unwrap_or(Path::new("")), out)

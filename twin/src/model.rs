@@ -84,6 +84,8 @@ pub struct Sensor {
     pub accuracy: AccuracySpec,
     /// The reference stays at its value until its next row.
     pub held_reference: bool,
+    /// Time by which readings stand for an earlier moment than their row, in s; `twin explain` finds it with an effect.
+    pub alignment_s: f64,
 }
 
 /// `[charge]`: the sensor's charge counter.

@@ -274,6 +274,7 @@ impl Work<'_> {
             full_scale: sensor.full_scale,
             range_limit: sensor.range_limit,
             held_reference: sensor.held_reference,
+            alignment_s: sensor.alignment_s,
             ..SensorBase::default()
         };
         if let Some(board) = board {

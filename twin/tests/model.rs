@@ -239,6 +239,7 @@ fn an_extended_model_in_another_folder_finds_its_table() {
     let shift = Shift {
         soc: -0.02,
         resistance: 0.5,
+        alignment_s: 0.0,
     };
     let extended = model.extended(&[], shift, &models, &out).unwrap();
     assert!(extended.contains("# measured"), "{extended}");

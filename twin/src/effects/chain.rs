@@ -36,7 +36,12 @@ impl<'a> Chain<'a> {
         if let Base::Sensor(base) = &problem.base
             && !base.reading.is_empty()
         {
-            let plain = chain.run(&[], Nuisance::default());
+            // The reading knows nothing of an alignment.
+            let unaligned = Nuisance {
+                alignment_s: -base.alignment_s,
+                ..Nuisance::default()
+            };
+            let plain = chain.run(&[], unaligned);
             chain.beside = base
                 .reading
                 .iter()

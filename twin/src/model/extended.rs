@@ -8,7 +8,7 @@ use std::{
 use toml_edit::{DocumentMut, Item, Table, TableLike, value};
 
 use super::Battery;
-use crate::failure::Failure;
+use crate::{effects::chain::Nuisance, failure::Failure};
 
 /// An effect to be written into a model file.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,13 +28,19 @@ pub struct Shift {
     pub soc: f64,
     /// Relative change of the ohmic resistance.
     pub resistance: f64,
+    /// Time by which readings stand for an earlier moment than their row, in s.
+    pub alignment_s: f64,
 }
 
 impl Shift {
     /// What was found for one signal; the first that says something counts.
-    pub fn take(&mut self, soc: f64, resistance: f64) {
+    pub fn take(&mut self, nuisance: Nuisance) {
         if *self == Self::default() {
-            *self = Self { soc, resistance };
+            *self = Self {
+                soc: nuisance.soc_shift,
+                resistance: nuisance.resistance,
+                alignment_s: nuisance.alignment_s,
+            };
         }
     }
 }
@@ -58,6 +64,11 @@ impl Extension<'_> {
             .and_then(Item::as_table_like_mut)
         {
             self.battery(battery);
+        }
+        if self.shift.alignment_s != 0.0
+            && let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut)
+        {
+            set(sensor, "alignment_s", value(self.shift.alignment_s));
         }
         if !self.effects.is_empty() {
             self.effects(&mut document)?;
