@@ -130,7 +130,9 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
     // Smoothing and offset by trial; the rate is still unknown, so only its middle matters.
     let mut best = Trial::worst();
     for shape in [Shape::Lag, Shape::Average] {
-        for smoothing_s in [0.0, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0].map(|steps| steps * step_s) {
+        for smoothing_s in
+            [0.0, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0].map(|steps| steps * step_s)
+        {
             if smoothing_s > fit.span_s / 10.0 || (smoothing_s == 0.0 && shape == Shape::Average) {
                 continue;
             }
@@ -138,7 +140,8 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
             let reach_s = 3.0 * grid_s + smoothing_s;
             let tries = 40;
             for index in 0..=tries {
-                let offset_s = coarse_s + reach_s * (2.0 * f64::from(index) / f64::from(tries) - 1.0);
+                let offset_s =
+                    coarse_s + reach_s * (2.0 * f64::from(index) / f64::from(tries) - 1.0);
                 let cost = fit.cost(&smooth, offset_s, 0.0);
                 best.take(Trial {
                     shape,
@@ -165,6 +168,22 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
         let start = Trial { shape, ..best };
         fine.take(fit.descend(start, step_s));
     }
+    // Edges that fall between two rows make many small valleys: look into the neighbouring ones.
+    for smoothing_s in [fine.smoothing_s, 0.0] {
+        let smooth = fit.smooth(fine.shape, smoothing_s);
+        let middle = fine;
+        for index in -80_i32..=80 {
+            let offset_s = middle.offset_s + f64::from(index) / 40.0 * step_s;
+            let cost = fit.cost(&smooth, offset_s, middle.drift_s);
+            fine.take(Trial {
+                smoothing_s,
+                offset_s,
+                cost,
+                ..middle
+            });
+        }
+    }
+    fine.take(fit.descend(fine, 0.05 * step_s));
     let smooth = fit.smooth(fine.shape, fine.smoothing_s);
     let correlation = fit.correlation(&smooth, fine.offset_s, fine.drift_s);
     if correlation.abs() < LEAST_CORRELATION {
@@ -239,7 +258,8 @@ fn correlate(driven: &Signal, sensed: &Signal, grid_s: f64) -> Option<(f64, f64)
             .zip(&x[shifted..shifted + length])
             .map(|(y, x)| y * x)
             .sum();
-        let energy = (squares_x[shifted + length] - squares_x[shifted]) * (squares_y[to] - squares_y[from]);
+        let energy =
+            (squares_x[shifted + length] - squares_x[shifted]) * (squares_y[to] - squares_y[from]);
         if energy <= 0.0 {
             continue;
         }
@@ -259,7 +279,10 @@ fn correlate(driven: &Signal, sensed: &Signal, grid_s: f64) -> Option<(f64, f64)
         return None;
     }
     let origin = |signal: &Signal| signal.t_s.first().copied().unwrap_or(0.0);
-    Some((best.abs(), origin(driven) - origin(sensed) + lag as f64 * grid_s))
+    Some((
+        best.abs(),
+        origin(driven) - origin(sensed) + lag as f64 * grid_s,
+    ))
 }
 
 /// Differences of the means over the cells of a grid that begins at the first row.
@@ -285,7 +308,8 @@ fn derivative(signal: &Signal, grid_s: f64) -> Vec<f64> {
         if let Some(before) = known {
             let (from, to) = (means[before], means[cell]);
             for between in before + 1..cell {
-                means[between] = from + (to - from) * (between - before) as f64 / (cell - before) as f64;
+                means[between] =
+                    from + (to - from) * (between - before) as f64 / (cell - before) as f64;
             }
         }
         known = Some(cell);
@@ -304,7 +328,10 @@ fn thinned(signal: &Signal) -> Signal {
 fn spread(values: &[f64]) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
-    match (sorted.get(sorted.len() / 50), sorted.get(sorted.len() - 1 - sorted.len() / 50)) {
+    match (
+        sorted.get(sorted.len() / 50),
+        sorted.get(sorted.len() - 1 - sorted.len() / 50),
+    ) {
         (Some(low), Some(high)) if high > low => high - low,
         _ => sorted.last().unwrap_or(&0.0) - sorted.first().unwrap_or(&0.0),
     }
@@ -417,11 +444,20 @@ impl Fit<'_> {
                 continue;
             }
             let share = (wanted - t_ref[at]) / (t_ref[at + 1] - t_ref[at]);
-            take(smooth[at] + (smooth[at + 1] - smooth[at]) * share, self.sensed.value[row]);
+            take(
+                smooth[at] + (smooth[at + 1] - smooth[at]) * share,
+                self.sensed.value[row],
+            );
         }
     }
 
-    fn sums(&self, smooth: &[f64], offset_s: f64, drift_s: f64, rows: std::ops::Range<usize>) -> Sums {
+    fn sums(
+        &self,
+        smooth: &[f64],
+        offset_s: f64,
+        drift_s: f64,
+        rows: std::ops::Range<usize>,
+    ) -> Sums {
         let mut sums = Sums::default();
         self.beside(smooth, offset_s, drift_s, rows, |x, y| sums.add(x, y));
         sums
@@ -432,7 +468,8 @@ impl Fit<'_> {
     }
 
     fn correlation(&self, smooth: &[f64], offset_s: f64, drift_s: f64) -> f64 {
-        self.sums(smooth, offset_s, drift_s, self.all()).correlation()
+        self.sums(smooth, offset_s, drift_s, self.all())
+            .correlation()
     }
 
     /// Mean cost of the residual after gain and zero.
@@ -462,7 +499,9 @@ impl Fit<'_> {
     fn scan(&self, step_s: f64) -> Option<(f64, f64)> {
         let driven_s = self.driven.t_s.first().copied()?;
         let span_s = self.driven.span_s();
-        let apart_s = (step_s / 20.0).max(self.driven.step_s()).max((span_s + self.span_s) / 20_000.0);
+        let apart_s = (step_s / 20.0)
+            .max(self.driven.step_s())
+            .max((span_s + self.span_s) / 20_000.0);
         let rows = self.sensed.t_s.len();
         if rows > 2000 {
             // That many readings have edges.
@@ -472,7 +511,9 @@ impl Fit<'_> {
         for window_s in [0.1, 0.25, 0.5, 1.0].map(|share| share * step_s) {
             let smooth = self.smooth(Shape::Average, window_s);
             let first_s = driven_s - self.start_s - (1.0 - LEAST_OVERLAP) * self.span_s;
-            let tries = ((span_s + (1.0 - 2.0 * LEAST_OVERLAP) * self.span_s) / apart_s).ceil().max(0.0) as usize;
+            let tries = ((span_s + (1.0 - 2.0 * LEAST_OVERLAP) * self.span_s) / apart_s)
+                .ceil()
+                .max(0.0) as usize;
             for index in 0..=tries {
                 let offset_s = first_s + index as f64 * apart_s;
                 let sums = self.sums(&smooth, offset_s, 0.0, self.all());
@@ -490,7 +531,13 @@ impl Fit<'_> {
     }
 
     /// Offset at the start and drift from the best offsets of several blocks.
-    fn blocks(&self, smooth: &[f64], offset_s: f64, grid_s: f64, step_s: f64) -> Option<(f64, f64)> {
+    fn blocks(
+        &self,
+        smooth: &[f64],
+        offset_s: f64,
+        grid_s: f64,
+        step_s: f64,
+    ) -> Option<(f64, f64)> {
         let rows = self.sensed.t_s.len();
         let reach_s = 3.0 * grid_s + FASTEST_RATE * self.span_s + step_s;
         let tries = ((4.0 * reach_s / step_s).ceil() as usize).clamp(50, 600);
@@ -500,7 +547,8 @@ impl Fit<'_> {
             if own.len() < 20 {
                 return None;
             }
-            let middle_s = 0.5 * (self.sensed.t_s[own.start] + self.sensed.t_s[own.end - 1]) - self.start_s;
+            let middle_s =
+                0.5 * (self.sensed.t_s[own.start] + self.sensed.t_s[own.end - 1]) - self.start_s;
             let mut best = (0.0_f64, 0.0_f64);
             for index in 0..=tries {
                 let shift_s = reach_s * (2.0 * index as f64 / tries as f64 - 1.0);
@@ -523,11 +571,18 @@ impl Fit<'_> {
         // Median of the slopes of all pairs: one block that went astray does not matter.
         let mut slopes = Vec::new();
         for (index, one) in found.iter().enumerate() {
-            slopes.extend(found[index + 1..].iter().map(|other| (other.1 - one.1) / (other.0 - one.0)));
+            slopes.extend(
+                found[index + 1..]
+                    .iter()
+                    .map(|other| (other.1 - one.1) / (other.0 - one.0)),
+            );
         }
         slopes.sort_by(f64::total_cmp);
         let slope = slopes[slopes.len() / 2].clamp(-FASTEST_RATE, FASTEST_RATE);
-        let mut starts: Vec<f64> = found.iter().map(|(at_s, shift_s)| shift_s - slope * at_s).collect();
+        let mut starts: Vec<f64> = found
+            .iter()
+            .map(|(at_s, shift_s)| shift_s - slope * at_s)
+            .collect();
         starts.sort_by(f64::total_cmp);
         Some((offset_s + starts[starts.len() / 2], slope * self.span_s))
     }
@@ -536,17 +591,27 @@ impl Fit<'_> {
     fn descend(&self, start: Trial, step_s: f64) -> Trial {
         let at = |point: [f64; 3]| {
             let smoothing_s = point[2].abs();
-            if smoothing_s > 0.3 * self.span_s || point[1].abs() > 2.0 * FASTEST_RATE * self.span_s + step_s {
+            if smoothing_s > 0.3 * self.span_s
+                || point[1].abs() > 2.0 * FASTEST_RATE * self.span_s + step_s
+            {
                 return f64::INFINITY;
             }
             let smooth = self.smooth(start.shape, smoothing_s);
             // Offset is that of the middle, so that it does not depend on the drift.
             self.cost(&smooth, point[0] - 0.5 * point[1], point[1])
         };
-        let origin = [start.offset_s + 0.5 * start.drift_s, start.drift_s, start.smoothing_s];
+        let origin = [
+            start.offset_s + 0.5 * start.drift_s,
+            start.drift_s,
+            start.smoothing_s,
+        ];
         let mut best = (origin, at(origin));
         for scale in [1.0, 0.2] {
-            let size = [step_s * scale, step_s * scale, (0.5 * start.smoothing_s + step_s) * scale];
+            let size = [
+                step_s * scale,
+                step_s * scale,
+                (0.5 * start.smoothing_s + step_s) * scale,
+            ];
             best = simplex(&at, best.0, size, 150);
         }
         Trial {
@@ -579,7 +644,13 @@ fn simplex(
     while spent < evaluations {
         points.sort_by(|one, other| one.1.total_cmp(&other.1));
         let worst = points[3];
-        let centre = [0, 1, 2].map(|axis| points[..3].iter().map(|(point, _)| point[axis]).sum::<f64>() / 3.0);
+        let centre = [0, 1, 2].map(|axis| {
+            points[..3]
+                .iter()
+                .map(|(point, _)| point[axis])
+                .sum::<f64>()
+                / 3.0
+        });
         let mut tried = along(worst.0, centre, 2.0);
         let mut value = cost(tried);
         spent += 1;
@@ -647,7 +718,11 @@ impl Sums {
 
     fn correlation(&self) -> f64 {
         let (xx, xy, yy) = self.moments();
-        if xx > 0.0 && yy > 0.0 { xy / (xx * yy).sqrt() } else { 0.0 }
+        if xx > 0.0 && yy > 0.0 {
+            xy / (xx * yy).sqrt()
+        } else {
+            0.0
+        }
     }
 
     /// Gain and zero.

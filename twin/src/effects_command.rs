@@ -84,7 +84,11 @@ pub fn run(arguments: &Arguments) -> String {
             .parameters
             .iter()
             .map(|parameter| {
-                let unit = if parameter.unit == "1" { String::new() } else { format!(" {}", parameter.unit) };
+                let unit = if parameter.unit == "1" {
+                    String::new()
+                } else {
+                    format!(" {}", parameter.unit)
+                };
                 let off = match parameter.off {
                     off if off == f64::INFINITY => "∞".to_owned(),
                     off if off == f64::NEG_INFINITY => "−∞".to_owned(),

@@ -98,7 +98,12 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             mapping: arguments.map.clone(),
         };
         let other = prepare(&model, &inputs, Purpose::Compare)?;
-        remarks.extend(other.remarks.iter().map(|remark| format!("{}: {remark}", file.display())));
+        remarks.extend(
+            other
+                .remarks
+                .iter()
+                .map(|remark| format!("{}: {remark}", file.display())),
+        );
         holdouts.push(Holdout {
             file: file.clone(),
             problems: other.problems(),
@@ -120,7 +125,10 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     report.inputs = data::Inputs {
         model: arguments.model.display().to_string(),
         recording: arguments.recording.display().to_string(),
-        reference: arguments.reference.as_ref().map(|path| path.display().to_string()),
+        reference: arguments
+            .reference
+            .as_ref()
+            .map(|path| path.display().to_string()),
         out: Some(out.display().to_string()),
     };
     let extended = extended(&model, &report, &arguments.model, out)?;
@@ -133,8 +141,12 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
         files.push(("calibration.toml", calibration));
     }
     write(out, &files)?;
-    let width = std::env::var("COLUMNS").ok().and_then(|width| width.parse().ok());
-    Ok(text::render(&report, width.unwrap_or(WIDTH)).trim_end().to_owned())
+    let width = std::env::var("COLUMNS")
+        .ok()
+        .and_then(|width| width.parse().ok());
+    Ok(text::render(&report, width.unwrap_or(WIDTH))
+        .trim_end()
+        .to_owned())
 }
 
 /// All files, or none.
@@ -186,11 +198,16 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
                     .iter()
                     .map(|(name, value)| format!("{name} = {value}"))
                     .collect();
-                known.comment.push(format!("From {}: {}.", fitted.signal, values.join(", ")));
+                known
+                    .comment
+                    .push(format!("From {}: {}.", fitted.signal, values.join(", ")));
                 continue;
             }
             let mut comment = vec![
-                format!("Found by twin explain in {}: {}", report.inputs.recording, said.statement),
+                format!(
+                    "Found by twin explain in {}: {}",
+                    report.inputs.recording, said.statement
+                ),
                 said.equation.clone(),
             ];
             for parameter in &said.parameters {
@@ -202,7 +219,10 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
             found.push(Found {
                 id: id.clone(),
                 parameters: parameters.clone(),
-                comment: comment.iter().map(|line| line.replace(['\n', '\r'], " ")).collect(),
+                comment: comment
+                    .iter()
+                    .map(|line| line.replace(['\n', '\r'], " "))
+                    .collect(),
             });
         }
         if !found.is_empty() {

@@ -211,7 +211,9 @@ impl Model {
         let source = path.display().to_string();
         let bytes = fs::read(path).map_err(|error| recording::Error::reading(path, &error))?;
         let text = String::from_utf8(bytes).map_err(|_| {
-            Failure::Input(format!("{source}: found bytes that are not UTF-8, expected TOML"))
+            Failure::Input(format!(
+                "{source}: found bytes that are not UTF-8, expected TOML"
+            ))
         })?;
         Self::parse(&source, text, path.parent().unwrap_or(Path::new(".")))
     }
@@ -238,7 +240,11 @@ impl Model {
             None => None,
         };
         if parsed.sensor.is_none() && battery.is_none() {
-            return Err(places.fault(&[], "neither [sensor] nor [battery]", "at least one of them"));
+            return Err(places.fault(
+                &[],
+                "neither [sensor] nor [battery]",
+                "at least one of them",
+            ));
         }
         let mut effects = Vec::new();
         // In the order of the file: a gain after an offset is not an offset after a gain.
@@ -288,11 +294,7 @@ impl Model {
 }
 
 /// A number in its place: zero or more, and finite.
-fn positive(
-    places: &Places<'_>,
-    table: &str,
-    values: &[(&str, f64)],
-) -> Result<(), Failure> {
+fn positive(places: &Places<'_>, table: &str, values: &[(&str, f64)]) -> Result<(), Failure> {
     for (key, value) in values {
         if !(value.is_finite() && *value >= 0.0) {
             return Err(places.fault(&[table, key], &value.to_string(), "a number, zero or more"));
@@ -316,7 +318,10 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
             ("range_limit", sensor.range_limit.unwrap_or(1.0)),
         ],
     )?;
-    for (key, value) in [("zero", sensor.accuracy.zero), ("gain", sensor.accuracy.gain)] {
+    for (key, value) in [
+        ("zero", sensor.accuracy.zero),
+        ("gain", sensor.accuracy.gain),
+    ] {
         if !(value.is_finite() && value >= 0.0) {
             let expected = "a number, zero or more";
             return Err(places.fault(&["sensor", "accuracy", key], &value.to_string(), expected));
@@ -456,15 +461,15 @@ fn read_ocv(path: &Path) -> Result<Vec<(f64, f64)>, Failure> {
     let (soc, volts) = (table.need("soc")?, table.need("ocv_v")?);
     let points: Vec<(f64, f64)> = soc.iter().copied().zip(volts.iter().copied()).collect();
     check_ocv(&points, |what, expected| {
-        Failure::Input(format!("{}: found {what}, expected {expected}", path.display()))
+        Failure::Input(format!(
+            "{}: found {what}, expected {expected}",
+            path.display()
+        ))
     })?;
     Ok(points)
 }
 
-fn check_ocv(
-    points: &[(f64, f64)],
-    fault: impl Fn(&str, &str) -> Failure,
-) -> Result<(), Failure> {
+fn check_ocv(points: &[(f64, f64)], fault: impl Fn(&str, &str) -> Failure) -> Result<(), Failure> {
     let expected = "pairs of state of charge (0 … 1, ascending) and V (positive)";
     if points.len() == 1 {
         return Err(fault("a single point", expected));
@@ -488,7 +493,11 @@ fn modelled(
 ) -> Result<(&'static str, Vec<f64>), Failure> {
     let Some((id, variants)) = registry::find(id) else {
         let known = registry::ids().join(", ");
-        return Err(places.fault(&["effects", id], "an unknown effect", &format!("one of {known}")));
+        return Err(places.fault(
+            &["effects", id],
+            "an unknown effect",
+            &format!("one of {known}"),
+        ));
     };
     // An internal parameter (a phase) may be left out.
     let fits = |parameters: &&&[Parameter]| {

@@ -3,9 +3,9 @@
 //! Nothing is invented: a missing reading is masked, a row without a reference is not part of the drive, a reading that a
 //! sensor merely holds counts once. Only the surroundings (temperatures, supply) are held over gaps.
 
-pub mod checks;
 mod battery;
 mod charge;
+pub mod checks;
 mod frame;
 mod held;
 mod series;
@@ -18,8 +18,7 @@ pub use frame::Frame;
 pub use held::{Freshness, freshness};
 
 use crate::{
-    align,
-    explain,
+    align, explain,
     failure::Failure,
     model::{FrontEndKind, Model, Sensor, registry},
     problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View},
@@ -228,7 +227,15 @@ impl Work<'_> {
             .unwrap_or("1")
             .to_owned();
         if value.is_some() || self.purpose == Purpose::Simulate {
-            let problem = self.sensor_problem(sensor, board.as_ref(), &drive, &observed, pace, &measured, &unit);
+            let problem = self.sensor_problem(
+                sensor,
+                board.as_ref(),
+                &drive,
+                &observed,
+                pace,
+                &measured,
+                &unit,
+            );
             items.push(Item {
                 problem,
                 rows: rows.clone(),
@@ -236,7 +243,14 @@ impl Work<'_> {
             });
         }
         if let Some(counter) = counter {
-            items.extend(charge::item(self, sensor, board.as_ref(), &drive, &parts.clocks, &counter)?);
+            items.extend(charge::item(
+                self,
+                sensor,
+                board.as_ref(),
+                &drive,
+                &parts.clocks,
+                &counter,
+            )?);
         }
         Ok(items)
     }
@@ -293,7 +307,8 @@ impl Work<'_> {
             observed,
             base: Base::Sensor(base),
             modelled: Vec::new(),
-            noise: (sensor.noise.powi(2) + sensor.noise_coloured.powi(2) + step * step / 12.0).sqrt(),
+            noise: (sensor.noise.powi(2) + sensor.noise_coloured.powi(2) + step * step / 12.0)
+                .sqrt(),
             accuracy: Accuracy {
                 zero: sensor.accuracy.zero,
                 gain: sensor.accuracy.gain,
@@ -302,14 +317,22 @@ impl Work<'_> {
     }
 
     /// The range flag of the simulated board where none was recorded, and a remark where it differs from a recorded one.
-    fn compare_range_flag(&mut self, board: &Board, drive: &mut Drive, observed: &Observed, simulated: &[f64]) {
+    fn compare_range_flag(
+        &mut self,
+        board: &Board,
+        drive: &mut Drive,
+        observed: &Observed,
+        simulated: &[f64],
+    ) {
         if !board.has_two_ranges() {
             return;
         }
         match &drive.range_high {
             None if observed.on_drive_rows => {
                 drive.range_high = Some(simulated.to_vec());
-                self.remark("range_high was not recorded: the simulated board's is used".to_owned());
+                self.remark(
+                    "range_high was not recorded: the simulated board's is used".to_owned(),
+                );
             }
             Some(recorded) if observed.on_drive_rows => {
                 let differ = recorded
@@ -353,7 +376,11 @@ impl Work<'_> {
 
     /// The counter's column, if it is there or asked for.
     fn charge_column(&self) -> Option<String> {
-        let stated = self.model.charge.as_ref().and_then(|charge| charge.column.clone());
+        let stated = self
+            .model
+            .charge
+            .as_ref()
+            .and_then(|charge| charge.column.clone());
         let name = stated.unwrap_or_else(|| "q_meas_c".to_owned());
         self.frame.has(&name).then_some(name)
     }
@@ -396,7 +423,13 @@ impl Work<'_> {
             ))
         })?;
         self.remark(alignment.remark());
-        self.clock = Some(self.frame.t_s().iter().map(|t| alignment.on_reference(*t)).collect());
+        self.clock = Some(
+            self.frame
+                .t_s()
+                .iter()
+                .map(|t| alignment.on_reference(*t))
+                .collect(),
+        );
         Ok(())
     }
 
@@ -439,13 +472,22 @@ impl Work<'_> {
         fresh: &Freshness,
     ) -> (Observed, Vec<usize>) {
         match (&self.clock, self.reference) {
-            (Some(clock), Some(_)) => series::own_rows(drive, clocks, &[0..clock.len()], clock, value, &fresh.rows),
+            (Some(clock), Some(_)) => {
+                series::own_rows(drive, clocks, &[0..clock.len()], clock, value, &fresh.rows)
+            }
             _ => {
                 let frame = self.frame;
                 if series::share_rows(rows, value) {
                     series::drive_rows(drive, rows, value, &fresh.rows)
                 } else {
-                    series::own_rows(drive, clocks, frame.clocks(), frame.t_s(), value, &fresh.rows)
+                    series::own_rows(
+                        drive,
+                        clocks,
+                        frame.clocks(),
+                        frame.t_s(),
+                        value,
+                        &fresh.rows,
+                    )
                 }
             }
         }
@@ -485,7 +527,10 @@ fn model_effects(model: &Model, problem: &mut Problem) {
         .iter()
         .map(|(id, values)| ((*id).to_owned(), values.clone()))
         .collect();
-    let (with, without) = (explain::predict(&plain, &effects), explain::predict(&plain, &[]));
+    let (with, without) = (
+        explain::predict(&plain, &effects),
+        explain::predict(&plain, &[]),
+    );
     for (reading, (with, without)) in base.reading.iter_mut().zip(with.iter().zip(&without)) {
         *reading += with - without;
     }

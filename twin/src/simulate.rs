@@ -8,7 +8,9 @@ use crate::problem::{Base, BatteryBase, Drive, Observed, Problem, SensorBase, Vi
 /// What the simulation as designed says at each observed row, without any effect; NaN where the drive does not reach.
 pub fn designed(problem: &Problem) -> Vec<f64> {
     match &problem.base {
-        Base::Sensor(base) if base.reading.len() == problem.observed.t_s.len() => base.reading.clone(),
+        Base::Sensor(base) if base.reading.len() == problem.observed.t_s.len() => {
+            base.reading.clone()
+        }
         Base::Sensor(base) => sensor(base, &problem.drive, &problem.observed, problem.view),
         Base::Battery(base) => battery(base, &problem.drive, &problem.observed, problem.view),
     }
@@ -23,9 +25,12 @@ fn sensor(base: &SensorBase, drive: &Drive, observed: &Observed, view: View) -> 
             let (segment, now_s) = (observed.segment[row], observed.t_s[row]);
             let value = match view {
                 View::Charge => {
-                    let before = last.filter(|(before, before_s)| *before == segment && now_s > *before_s);
+                    let before =
+                        last.filter(|(before, before_s)| *before == segment && now_s > *before_s);
                     last = Some((segment, now_s));
-                    return before.map_or(f64::NAN, |(_, before_s)| area.mean(segment, before_s, now_s));
+                    return before.map_or(f64::NAN, |(_, before_s)| {
+                        area.mean(segment, before_s, now_s)
+                    });
                 }
                 _ if base.window_s > 0.0 => area.mean(segment, now_s - base.window_s, now_s),
                 _ if observed.on_drive_rows => drive.reference[row],
@@ -113,7 +118,11 @@ impl<'a> Area<'a> {
 
     /// The last row not after a time, the first one if there is none.
     fn row(&self, segment: usize, at_s: f64) -> Option<(usize, usize)> {
-        let rows = self.drive.segments.get(segment).filter(|rows| !rows.is_empty())?;
+        let rows = self
+            .drive
+            .segments
+            .get(segment)
+            .filter(|rows| !rows.is_empty())?;
         let after = self.drive.t_s[rows.clone()].partition_point(|t| *t <= at_s);
         Some((rows.start + after.saturating_sub(1), rows.end))
     }

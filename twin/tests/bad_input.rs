@@ -15,7 +15,8 @@ fn current(t: f64) -> f64 {
 }
 
 fn good() -> String {
-    "t_s,i_ref_a,i_meas_a\n".to_owned() + &rows(300, |t| format!("{t},{},{}", current(t), current(t) + 0.5))
+    "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| format!("{t},{},{}", current(t), current(t) + 0.5))
 }
 
 /// Runs a command in a folder with these files; its sentence. Nothing may be left beside them.
@@ -51,7 +52,15 @@ fn names(folder: &Path) -> Vec<String> {
 fn explained(model: &str, recording: &str) -> String {
     refused(
         &[("m.toml", model), ("r.csv", recording)],
-        &["explain", "--model", "m.toml", "--recording", "r.csv", "--out", "out"],
+        &[
+            "explain",
+            "--model",
+            "m.toml",
+            "--recording",
+            "r.csv",
+            "--out",
+            "out",
+        ],
     )
 }
 
@@ -64,8 +73,13 @@ fn says(sentence: &str, parts: &[&str]) {
 #[test]
 fn two_units() {
     let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
-        + &rows(300, |t| format!("{t},{},{}", 1000.0 * current(t), current(t)));
-    says(&explained(PAIR, &recording), &["i_ref_a", "i_meas_a", "factor near 1000", "same unit"]);
+        + &rows(300, |t| {
+            format!("{t},{},{}", 1000.0 * current(t), current(t))
+        });
+    says(
+        &explained(PAIR, &recording),
+        &["i_ref_a", "i_meas_a", "factor near 1000", "same unit"],
+    );
     let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
         + &rows(300, |t| format!("{t},{},{}", current(t), 1e6 * current(t)));
     says(&explained(PAIR, &recording), &["factor near 1000000"]);
@@ -76,7 +90,13 @@ fn opposite_signs() {
     let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
         + &rows(300, |t| format!("{t},{},{}", current(t), -current(t)));
     let sentence = explained(PAIR, &recording);
-    says(&sentence, &["i_meas_a falls where i_ref_a rises", "--map i_meas_a=-i_meas_a"]);
+    says(
+        &sentence,
+        &[
+            "i_meas_a falls where i_ref_a rises",
+            "--map i_meas_a=-i_meas_a",
+        ],
+    );
 }
 
 #[test]
@@ -87,7 +107,15 @@ fn the_proposed_mapping_is_taken() {
     fs::write(folder.path().join("m.toml"), PAIR).unwrap();
     fs::write(folder.path().join("r.csv"), recording).unwrap();
     let output = Command::new(env!("CARGO_BIN_EXE_twin"))
-        .args(["simulate", "--model", "m.toml", "--recording", "r.csv", "--out", "s.csv"])
+        .args([
+            "simulate",
+            "--model",
+            "m.toml",
+            "--recording",
+            "r.csv",
+            "--out",
+            "s.csv",
+        ])
         .args(["--map", "i_meas_a=-i_meas_a"])
         .current_dir(folder.path())
         .output()
@@ -101,19 +129,36 @@ fn a_reference_of_another_time() {
     let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
         + &rows(300, |t| format!("{t},{},", current(t)))
         + &rows(300, |t| format!("{},,{}", t + 100.0, current(t)));
-    says(&explained(PAIR, &recording), &["i_meas_a", "100 … 129.9 s", "0 … 29.9 s", "same time"]);
+    says(
+        &explained(PAIR, &recording),
+        &["i_meas_a", "100 … 129.9 s", "0 … 29.9 s", "same time"],
+    );
     // In two files: nothing in common. The second is no shifted or scaled copy of the first.
-    let reference = "t_s,i_ref_a\n".to_owned() + &rows(600, |t| format!("{t},{}", (0.05 * t * t).sin()));
+    let reference =
+        "t_s,i_ref_a\n".to_owned() + &rows(600, |t| format!("{t},{}", (0.05 * t * t).sin()));
     let mut state = 1_u32;
     let mut noise = move || {
         state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
         f64::from(state >> 8) / f64::from(1 << 24)
     };
-    let sensor = "t_s,i_meas_a\n".to_owned() + &rows(600, |t| format!("{},{}", t + 5000.0, noise()));
+    let sensor =
+        "t_s,i_meas_a\n".to_owned() + &rows(600, |t| format!("{},{}", t + 5000.0, noise()));
     let sentence = refused(
-        &[("m.toml", PAIR), ("r.csv", &sensor), ("ref.csv", &reference)],
         &[
-            "explain", "--model", "m.toml", "--recording", "r.csv", "--reference", "ref.csv", "--out", "out",
+            ("m.toml", PAIR),
+            ("r.csv", &sensor),
+            ("ref.csv", &reference),
+        ],
+        &[
+            "explain",
+            "--model",
+            "m.toml",
+            "--recording",
+            "r.csv",
+            "--reference",
+            "ref.csv",
+            "--out",
+            "out",
         ],
     );
     says(&sentence, &["ref.csv", "r.csv", "overlap in time"]);
@@ -121,19 +166,34 @@ fn a_reference_of_another_time() {
 
 #[test]
 fn a_column_that_never_moves() {
-    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned() + &rows(300, |t| format!("{t},{},3.5", current(t)));
-    says(&explained(PAIR, &recording), &["r.csv", "i_meas_a", "3.5 in every row", "moves"]);
-    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned() + &rows(300, |t| format!("{t},2,{}", current(t)));
-    says(&explained(PAIR, &recording), &["r.csv", "i_ref_a", "2 in every row"]);
-    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned() + &rows(300, |t| format!("{t},{},", current(t)));
-    says(&explained(PAIR, &recording), &["r.csv", "i_meas_a", "no value"]);
+    let recording =
+        "t_s,i_ref_a,i_meas_a\n".to_owned() + &rows(300, |t| format!("{t},{},3.5", current(t)));
+    says(
+        &explained(PAIR, &recording),
+        &["r.csv", "i_meas_a", "3.5 in every row", "moves"],
+    );
+    let recording =
+        "t_s,i_ref_a,i_meas_a\n".to_owned() + &rows(300, |t| format!("{t},2,{}", current(t)));
+    says(
+        &explained(PAIR, &recording),
+        &["r.csv", "i_ref_a", "2 in every row"],
+    );
+    let recording =
+        "t_s,i_ref_a,i_meas_a\n".to_owned() + &rows(300, |t| format!("{t},{},", current(t)));
+    says(
+        &explained(PAIR, &recording),
+        &["r.csv", "i_meas_a", "no value"],
+    );
 }
 
 #[test]
 fn too_few_rows() {
     let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
         + &rows(20, |t| format!("{t},{},{}", current(t), current(t) + 0.5));
-    says(&explained(PAIR, &recording), &["r.csv", "i_meas_a", "20 readings", "at least 50"]);
+    says(
+        &explained(PAIR, &recording),
+        &["r.csv", "i_meas_a", "20 readings", "at least 50"],
+    );
 }
 
 #[test]
@@ -145,45 +205,99 @@ fn an_unknown_key() {
 #[test]
 fn a_missing_column() {
     let recording = good().replacen("i_meas_a", "board", 1);
-    says(&explained(PAIR, &recording), &["r.csv", "\"board\"", "i_meas_a"]);
+    says(
+        &explained(PAIR, &recording),
+        &["r.csv", "t_s, i_ref_a, board", "i_meas_a"],
+    );
     let recording = good().replacen("i_ref_a", "shunt", 1);
     says(&explained(PAIR, &recording), &["r.csv", "shunt", "i_ref_a"]);
     let battery = "schema = 1\n[battery]\ncapacity_ah = 2\nocv = [[0, 3.0], [1, 4.0]]\n";
-    says(&explained(battery, &good()), &["r.csv", "soc_pct, v_cell_v or v_pack_v", "--map"]);
+    says(
+        &explained(battery, &good()),
+        &["r.csv", "soc_pct, v_cell_v or v_pack_v", "--map"],
+    );
 }
 
 #[test]
 fn a_battery_in_other_units_or_signs() {
     let battery = "schema = 1\n[battery]\ncapacity_ah = 2\nocv = [[0, 3.0], [1, 4.0]]\nohmic_resistance_ohm = 0.1\n";
     let recording = |volts: &dyn Fn(f64) -> f64| {
-        "t_s,i_ref_a,v_cell_v\n".to_owned() + &rows(300, |t| format!("{t},{},{}", current(t), volts(current(t))))
+        "t_s,i_ref_a,v_cell_v\n".to_owned()
+            + &rows(300, |t| format!("{t},{},{}", current(t), volts(current(t))))
     };
-    says(&explained(battery, &recording(&|i| 3700.0 - 100.0 * i)), &["v_cell_v", "10^3", "expected V"]);
+    says(
+        &explained(battery, &recording(&|i| 3700.0 - 100.0 * i)),
+        &["v_cell_v", "10^3", "expected V"],
+    );
     let sentence = explained(battery, &recording(&|i| 3.7 + 0.1 * i));
-    says(&sentence, &["v_cell_v rises where i_ref_a rises", "--map i_ref_a=-i_ref_a"]);
-    let recording = "t_s,i_ref_a,soc_pct\n".to_owned() + &rows(300, |t| format!("{t},{},{}", current(t), 0.9 - 1e-3 * t));
+    says(
+        &sentence,
+        &[
+            "v_cell_v rises where i_ref_a rises",
+            "--map i_ref_a=-i_ref_a",
+        ],
+    );
+    let recording = "t_s,i_ref_a,soc_pct\n".to_owned()
+        + &rows(300, |t| format!("{t},{},{}", current(t), 0.9 - 1e-3 * t));
     says(&explained(battery, &recording), &["soc_pct", "per cent"]);
 }
 
 #[test]
 fn files_that_are_not_there_and_effects_that_do_not_exist() {
     let files: [(&str, &str); 2] = [("m.toml", PAIR), ("r.csv", &good())];
-    let base = ["explain", "--model", "m.toml", "--recording", "r.csv", "--out"];
-    let with = |more: &[&'static str]| -> Vec<&'static str> { base.iter().chain(more).copied().collect() };
-    says(&refused(&files, &with(&["out", "--without", "ofset"])), &["ofset", "offset, gain"]);
+    let base = [
+        "explain",
+        "--model",
+        "m.toml",
+        "--recording",
+        "r.csv",
+        "--out",
+    ];
+    let with =
+        |more: &[&'static str]| -> Vec<&'static str> { base.iter().chain(more).copied().collect() };
+    says(
+        &refused(&files, &with(&["out", "--without", "ofset"])),
+        &["ofset", "offset, gain"],
+    );
     says(&refused(&files, &with(&["m.toml"])), &["m.toml", "folder"]);
-    says(&refused(&files, &with(&["out", "--holdout", "no.csv"])), &["no.csv", "no such file"]);
-    says(&refused(&files, &with(&["out", "--map", "i_ref_a=shunt"])), &["shunt"]);
-    let simulate = ["simulate", "--model", "no.toml", "--recording", "r.csv", "--out", "s.csv"];
+    says(
+        &refused(&files, &with(&["out", "--holdout", "no.csv"])),
+        &["no.csv", "no such file"],
+    );
+    says(
+        &refused(&files, &with(&["out", "--map", "i_ref_a=shunt"])),
+        &["shunt"],
+    );
+    let simulate = [
+        "simulate",
+        "--model",
+        "no.toml",
+        "--recording",
+        "r.csv",
+        "--out",
+        "s.csv",
+    ];
     says(&refused(&files, &simulate), &["no.toml", "no such file"]);
-    let simulate = ["simulate", "--model", "m.toml", "--recording", "r.csv", "--out", "s.txt"];
+    let simulate = [
+        "simulate",
+        "--model",
+        "m.toml",
+        "--recording",
+        "r.csv",
+        "--out",
+        "s.txt",
+    ];
     says(&refused(&files, &simulate), &["s.txt", ".csv or .parquet"]);
 }
 
 #[test]
 fn an_implausible_reference_is_said_to_be_one() {
     let folder = tempfile::tempdir().unwrap();
-    fs::write(folder.path().join("m.toml"), "schema = 1\n[sensor]\nfull_scale = 15\n").unwrap();
+    fs::write(
+        folder.path().join("m.toml"),
+        "schema = 1\n[sensor]\nfull_scale = 15\n",
+    )
+    .unwrap();
     let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
         + &rows(400, |t| {
             // Stuck for 6 s, with one spike.
@@ -196,13 +310,24 @@ fn an_implausible_reference_is_said_to_be_one() {
         });
     fs::write(folder.path().join("r.csv"), recording).unwrap();
     let output = Command::new(env!("CARGO_BIN_EXE_twin"))
-        .args(["explain", "--model", "m.toml", "--recording", "r.csv", "--out", "out"])
+        .args([
+            "explain",
+            "--model",
+            "m.toml",
+            "--recording",
+            "r.csv",
+            "--out",
+            "out",
+        ])
         .current_dir(folder.path())
         .output()
         .unwrap();
     assert_eq!(output.status.code(), Some(0), "{output:?}");
     let report = fs::read_to_string(folder.path().join("out/report.json")).unwrap();
-    says(&report, &["stands at 2", "jumps there and back", "full scale of 15"]);
+    says(
+        &report,
+        &["stands at 2", "jumps there and back", "full scale of 15"],
+    );
     let mut written = names(&folder.path().join("out"));
     written.sort();
     assert_eq!(written, ["model.toml", "report.html", "report.json"]);

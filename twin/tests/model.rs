@@ -45,7 +45,12 @@ fn reads_what_the_documentation_shows() {
 #[test]
 fn the_documentation_names_every_key() {
     let documentation = include_str!("../../docs/model-file.md");
-    let unknown = ["[sensor]\nx = 1", "[charge]\nx = 1", "[battery]\nx = 1", "x = 1"];
+    let unknown = [
+        "[sensor]\nx = 1",
+        "[charge]\nx = 1",
+        "[battery]\nx = 1",
+        "x = 1",
+    ];
     for text in unknown {
         let Err(Failure::Input(sentence)) = parse(&format!("schema = 1\n{text}\n")) else {
             panic!("{text}");
@@ -82,26 +87,69 @@ fn the_models_of_this_project_are_read() {
 #[test]
 fn faults_name_line_key_and_what_was_expected() {
     let cases: [(&str, &[&str]); 16] = [
-        ("schema = 1\n[sensor]\nstepp = 1\n", &["line 3", "stepp", "`step`", "`noise_coloured`"]),
-        ("schema = 2\n[sensor]\n", &["line 1", "schema", "found 2", "expected 1"]),
+        (
+            "schema = 1\n[sensor]\nstepp = 1\n",
+            &["line 3", "stepp", "`step`", "`noise_coloured`"],
+        ),
+        (
+            "schema = 2\n[sensor]\n",
+            &["line 1", "schema", "found 2", "expected 1"],
+        ),
         ("[sensor]\n", &["schema"]),
-        ("schema = 1\n[sensor]\nstep = \"x\"\n", &["line 3", "key step", "string", "f64"]),
-        ("schema = 1\n[sensor]\nnoise = -1\n", &["line 3", "sensor.noise", "-1", "zero or more"]),
-        ("schema = 1\n[sensor]\nfront_end = \"hall\"\n", &["line 3", "hall", "`dual-range`"]),
+        (
+            "schema = 1\n[sensor]\nstep = \"x\"\n",
+            &["line 3", "key step", "string", "f64"],
+        ),
+        (
+            "schema = 1\n[sensor]\nnoise = -1\n",
+            &["line 3", "sensor.noise", "-1", "zero or more"],
+        ),
+        (
+            "schema = 1\n[sensor]\nfront_end = \"hall\"\n",
+            &["line 3", "hall", "`dual-range`"],
+        ),
         ("schema = 1\n", &["neither [sensor] nor [battery]"]),
-        ("schema = 1\n[sensor]\nfront_end = \"hah1bv\"\nstep = 1\n", &["line 4", "sensor.step", "its converter"]),
-        ("schema = 1\n[sensor]\naverage = 8\n", &["line 3", "average", "window_s"]),
-        ("schema = 1\n[battery]\ncapacity_ah = 0\n", &["line 3", "battery.capacity_ah", "above 0"]),
-        ("schema = 1\n[battery]\ncapacity_ah = 2\ninitial_soc = 95\n", &["line 4", "initial_soc", "0 to 1"]),
+        (
+            "schema = 1\n[sensor]\nfront_end = \"hah1bv\"\nstep = 1\n",
+            &["line 4", "sensor.step", "its converter"],
+        ),
+        (
+            "schema = 1\n[sensor]\naverage = 8\n",
+            &["line 3", "average", "window_s"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 0\n",
+            &["line 3", "battery.capacity_ah", "above 0"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\ninitial_soc = 95\n",
+            &["line 4", "initial_soc", "0 to 1"],
+        ),
         (
             "schema = 1\n[battery]\ncapacity_ah = 2\nocv = [[0.5, 3.6], [0.4, 3.5]]\n",
-            &["line 4", "battery.ocv", "(0.4, 3.5) as point 2", "ascending"],
+            &[
+                "line 4",
+                "battery.ocv",
+                "(0.4, 3.5) as point 2",
+                "ascending",
+            ],
         ),
-        ("schema = 1\n[sensor]\n[effects.ofset]\noffset_a = 1\n", &["line 3", "ofset", "offset, gain"]),
-        ("schema = 1\n[sensor]\n[effects.offset]\noffset = 1\n", &["line 4", "effects.offset.offset", "offset_a"]),
+        (
+            "schema = 1\n[sensor]\n[effects.ofset]\noffset_a = 1\n",
+            &["line 3", "ofset", "offset, gain"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.offset]\noffset = 1\n",
+            &["line 4", "effects.offset.offset", "offset_a"],
+        ),
         (
             "schema = 1\n[sensor]\n[effects.clipping]\nhigh_a = 1\n",
-            &["line 3", "effects.clipping", "not all parameters", "high_a, low_a"],
+            &[
+                "line 3",
+                "effects.clipping",
+                "not all parameters",
+                "high_a, low_a",
+            ],
         ),
         ("schema = 1\n[sensor\n", &["line 2"]),
     ];
@@ -133,18 +181,27 @@ fn an_extended_model_is_still_its_users_file() {
         },
     ];
     let here = Path::new(".");
-    let text = model.extended(&found, Shift::default(), here, here).unwrap();
+    let text = model
+        .extended(&found, Shift::default(), here, here)
+        .unwrap();
     assert!(text.starts_with(PAIR), "{text}");
     assert!(text.contains("# A low-pass.\n[effects.lag]"), "{text}");
     let again = parse(&text).unwrap();
     // In the order of the file, and to the last digit.
     assert_eq!(
         again.effects,
-        [("offset", vec![0.25]), ("lag", vec![0.1 + 0.2]), ("gain", vec![1.01])]
+        [
+            ("offset", vec![0.25]),
+            ("lag", vec![0.1 + 0.2]),
+            ("gain", vec![1.01])
+        ]
     );
     assert_eq!(again.sensor, model.sensor);
     // Nothing found: nothing changed.
-    assert_eq!(model.extended(&[], Shift::default(), here, here).unwrap(), PAIR);
+    assert_eq!(
+        model.extended(&[], Shift::default(), here, here).unwrap(),
+        PAIR
+    );
 }
 
 #[test]
@@ -156,7 +213,9 @@ fn an_effect_that_is_there_gets_the_new_values() {
         comment: Vec::new(),
     }];
     let here = Path::new(".");
-    let text = model.extended(&found, Shift::default(), here, here).unwrap();
+    let text = model
+        .extended(&found, Shift::default(), here, here)
+        .unwrap();
     assert_eq!(parse(&text).unwrap().effects, [("offset", vec![0.5])]);
 }
 
@@ -171,7 +230,10 @@ fn an_extended_model_in_another_folder_finds_its_table() {
                 ohmic_resistance_ohm = 0.02\ninitial_soc = 0.9\n";
     fs::write(&path, text).unwrap();
     let model = Model::read(&path).unwrap();
-    assert_eq!(model.battery.as_ref().unwrap().ocv, [(0.0, 3.0), (1.0, 4.0)]);
+    assert_eq!(
+        model.battery.as_ref().unwrap().ocv,
+        [(0.0, 3.0), (1.0, 4.0)]
+    );
     // A folder that is not there yet.
     let out = folder.path().join("deep/er");
     let shift = Shift {

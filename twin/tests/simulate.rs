@@ -70,7 +70,8 @@ fn the_board_reports_what_the_firmwares_composition_does() {
     let rows = profile();
     let mut host = HostBoard::new(&rows, Timing::default(), Configuration::default());
     // Reading and charge after each conversion.
-    let (mut t_s, mut current, mut charge, mut edge) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut t_s, mut current, mut charge, mut edge) =
+        (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     let mut edges = 0;
     while let Some(step) = host.step() {
         if let Step::Event(Event::Conversion { at_us, .. }) = step {
@@ -90,10 +91,20 @@ fn the_board_reports_what_the_firmwares_composition_does() {
         if edge[row] || edge[row - 1] || reported.current_a[row].is_nan() {
             continue;
         }
-        let step = board.step_a() * if reported.range_high[row] > 0.5 { 10.0 } else { 1.0 };
+        let step = board.step_a()
+            * if reported.range_high[row] > 0.5 {
+                10.0
+            } else {
+                1.0
+            };
         let apart = (reported.current_a[row] - current[row]).abs();
         // The same conversion through the same code: a code at most, where rounding falls the other way.
-        assert!(apart <= 1.01 * step, "row {row}: {} and {}", reported.current_a[row], current[row]);
+        assert!(
+            apart <= 1.01 * step,
+            "row {row}: {} and {}",
+            reported.current_a[row],
+            current[row]
+        );
         compared += 1;
     }
     assert!(compared > 3000, "{compared}");
@@ -117,15 +128,33 @@ fn the_counter_counts_the_charge() {
         let last = flowed[flowed.len() - 1];
         flowed.push(last + 0.5 * (pair[0].current_a + pair[1].current_a) * 0.1);
     }
-    for kind in [FrontEndKind::DualRange, FrontEndKind::Hah1bv, FrontEndKind::Network, FrontEndKind::ClosedLoop] {
+    for kind in [
+        FrontEndKind::DualRange,
+        FrontEndKind::Hah1bv,
+        FrontEndKind::Network,
+        FrontEndKind::ClosedLoop,
+    ] {
         let board = Board::new(kind, 1).unwrap();
-        let reported = board.run(&drive, false, &observed(drive.t_s.clone()), Pace::Free, true);
-        let changes = reported.range_high.windows(2).filter(|pair| pair[0] != pair[1]).count();
+        let reported = board.run(
+            &drive,
+            false,
+            &observed(drive.t_s.clone()),
+            Pace::Free,
+            true,
+        );
+        let changes = reported
+            .range_high
+            .windows(2)
+            .filter(|pair| pair[0] != pair[1])
+            .count();
         let step = board.charge_step_c() * if changes > 0 { 10.0 } else { 1.0 };
         for (row, (counted, flowed)) in reported.charge_c.iter().zip(&flowed).enumerate() {
             // A count, and the hidden fraction of one at each range change.
             let bound = 1.1 * step + 0.0302 * changes as f64;
-            assert!((counted - flowed).abs() < bound, "{kind:?} row {row}: {counted} and {flowed}");
+            assert!(
+                (counted - flowed).abs() < bound,
+                "{kind:?} row {row}: {counted} and {flowed}"
+            );
         }
     }
 }
@@ -149,7 +178,10 @@ fn a_reading_is_the_current_within_half_a_step() {
         };
         let reported = board.run(&drive, false, &observed(t_s), Pace::Free, false);
         for current in reported.current_a {
-            assert!((current - level).abs() <= 0.51 * board.step_a(), "{kind:?}: {current}");
+            assert!(
+                (current - level).abs() <= 0.51 * board.step_a(),
+                "{kind:?}: {current}"
+            );
         }
     }
     // Steps by hand: 120 A · 5 V / 4.5 V / 2¹³ codes; 5 V / 2¹³ / 4 mV/A.
@@ -228,7 +260,11 @@ fn explaining_begins_where_simulating_ends() {
         (View::Sensor, sensor(0.7, false), shared.clone()),
         (View::Charge, sensor(0.0, false), observed(own.clone())),
         (View::Charge, sensor(0.0, true), observed(own.clone())),
-        (View::StateOfCharge, Base::Battery(battery.clone()), shared.clone()),
+        (
+            View::StateOfCharge,
+            Base::Battery(battery.clone()),
+            shared.clone(),
+        ),
         (View::Voltage, Base::Battery(battery.clone()), shared),
         (View::Voltage, Base::Battery(battery), observed(own)),
     ];
@@ -241,7 +277,10 @@ fn explaining_begins_where_simulating_ends() {
             if here.is_nan() && there.is_nan() {
                 continue;
             }
-            assert!((here - there).abs() < 1e-9, "case {index}, row {row}: {here} and {there}");
+            assert!(
+                (here - there).abs() < 1e-9,
+                "case {index}, row {row}: {here} and {there}"
+            );
             compared += 1;
         }
         assert!(compared >= 899, "case {index}: {compared}");
@@ -263,7 +302,12 @@ fn prepared(folder: &Path, model: &str, recording: &str, purpose: Purpose) -> (M
 fn recording() -> String {
     let mut text = "t_s,i_ref_a,i_meas_a\n".to_owned();
     for row in profile() {
-        text.push_str(&format!("{},{},{}\n", row.t_s, row.current_a, 1.01 * row.current_a + 0.3));
+        text.push_str(&format!(
+            "{},{},{}\n",
+            row.t_s,
+            row.current_a,
+            1.01 * row.current_a + 0.3
+        ));
     }
     text
 }
@@ -272,7 +316,11 @@ fn recording() -> String {
 #[test]
 fn an_extended_model_reproduces_the_explanation() {
     let folder = tempfile::tempdir().unwrap();
-    let effects = [("offset".to_owned(), vec![0.3]), ("lag".to_owned(), vec![0.4]), ("gain".to_owned(), vec![1.01])];
+    let effects = [
+        ("offset".to_owned(), vec![0.3]),
+        ("lag".to_owned(), vec![0.4]),
+        ("gain".to_owned(), vec![1.01]),
+    ];
     for front_end in ["pair", "dual-range"] {
         let plain = format!("schema = 1\n[sensor]\nfront_end = \"{front_end}\"\n");
         let extended = format!(
@@ -283,11 +331,18 @@ fn an_extended_model_reproduces_the_explanation() {
         let (model, extended) = prepared(folder.path(), &extended, &recording(), Purpose::Compare);
         assert_eq!(extended.items[0].problem.modelled.len(), 3);
         let written = columns(&model, &extended);
-        let again = &written.iter().find(|(name, _)| name == "i_meas_a").unwrap().1;
+        let again = &written
+            .iter()
+            .find(|(name, _)| name == "i_meas_a")
+            .unwrap()
+            .1;
         let mut compared = 0;
         for (row, (after, again)) in after.iter().zip(again).enumerate() {
             if after.is_finite() {
-                assert!((after - again).abs() < 1e-9, "{front_end}, row {row}: {after} and {again}");
+                assert!(
+                    (after - again).abs() < 1e-9,
+                    "{front_end}, row {row}: {after} and {again}"
+                );
                 compared += 1;
             }
         }
@@ -307,12 +362,18 @@ fn simulating_needs_nothing_but_the_drive() {
     let (model, prepared) = prepared(folder.path(), model, &text, Purpose::Simulate);
     let written = columns(&model, &prepared);
     let names: Vec<&str> = written.iter().map(|(name, _)| name.as_str()).collect();
-    assert_eq!(names, ["t_s", "i_meas_a", "soc_pct", "v_cell_v", "q_meas_c"]);
+    assert_eq!(
+        names,
+        ["t_s", "i_meas_a", "soc_pct", "v_cell_v", "q_meas_c"]
+    );
     let column = |name: &str| &written.iter().find(|(known, _)| known == name).unwrap().1;
     // 45 A at the end: open circuit less the ohmic drop.
     let (soc, volts) = (column("soc_pct")[1199], column("v_cell_v")[1199]);
     assert!((volts - (3.0 + soc / 100.0 - 0.045)).abs() < 1e-9);
     // A straight line counts what the state of charge has lost, within counts and range changes.
     let charge = column("q_meas_c")[1199];
-    assert!((charge - (50.0 - soc) / 100.0 * 100.0 * 3600.0).abs() < 1.0, "{charge} {soc}");
+    assert!(
+        (charge - (50.0 - soc) / 100.0 * 100.0 * 3600.0).abs() < 1.0,
+        "{charge} {soc}"
+    );
 }

@@ -47,15 +47,24 @@ pub(super) fn render(model: &Model, report: &Report) -> Option<String> {
     let mut text = String::new();
     let mut left = Vec::new();
     for fitted in &report.models {
-        let Some((_, gain, zero)) = CORRECTIONS.iter().find(|(signal, _, _)| *signal == fitted.signal) else {
+        let Some((_, gain, zero)) = CORRECTIONS
+            .iter()
+            .find(|(signal, _, _)| *signal == fitted.signal)
+        else {
             continue;
         };
         let (mut small, mut large) = (Line::IDEAL, Line::IDEAL);
         // What the model file had already is in the board's reading as well.
         let had = model.effects.iter().filter_map(|(id, values)| {
             let card = find_with(id, values.len())?.card();
-            let names = card.parameters.iter().map(|parameter| parameter.name.to_owned());
-            Some(((*id).to_owned(), names.zip(values.iter().copied()).collect::<Vec<_>>()))
+            let names = card
+                .parameters
+                .iter()
+                .map(|parameter| parameter.name.to_owned());
+            Some((
+                (*id).to_owned(),
+                names.zip(values.iter().copied()).collect::<Vec<_>>(),
+            ))
         });
         let named = fitted.effects.iter().filter(|(id, _)| {
             report
@@ -103,21 +112,33 @@ pub(super) fn render(model: &Model, report: &Report) -> Option<String> {
         report.inputs.recording
     );
     if !left.is_empty() {
-        head.push_str(&format!("# Not to be corrected by them: {}.\n", left.join(", ")));
+        head.push_str(&format!(
+            "# Not to be corrected by them: {}.\n",
+            left.join(", ")
+        ));
     }
     Some(head + &text)
 }
 
 /// One register with the values for the small and the large sensor.
 fn register(name: &str, values: [f64; 2]) -> Option<String> {
-    let (field, said) = FIELDS.iter().zip(FIELD_TEXTS).find(|(_, text)| text.name == name)?;
+    let (field, said) = FIELDS
+        .iter()
+        .zip(FIELD_TEXTS)
+        .find(|(_, text)| text.name == name)?;
     let values = values.map(|value| value.round() as i64);
     let mut text = format!(
         "[[register]]\nname = \"{name}\"\naddress = 0x{:04X}\nunit = \"{}\"\nsmall = {}\nlarge = {}\n",
         field.layout.address, said.unit, values[0], values[1]
     );
-    if values.iter().any(|value| !(field.min..=field.max).contains(value)) {
-        text.push_str(&format!("# Beyond the board's limits, {} … {}.\n", field.min, field.max));
+    if values
+        .iter()
+        .any(|value| !(field.min..=field.max).contains(value))
+    {
+        text.push_str(&format!(
+            "# Beyond the board's limits, {} … {}.\n",
+            field.min, field.max
+        ));
     }
     Some(text + "\n")
 }

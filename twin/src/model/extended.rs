@@ -53,7 +53,10 @@ impl Extension<'_> {
     /// `text` with it; everything else stays as it is.
     pub(super) fn write(&self, text: &str) -> Result<String, Failure> {
         let mut document: DocumentMut = text.parse().map_err(|_| self.wrong("not TOML"))?;
-        if let Some(battery) = document.get_mut("battery").and_then(Item::as_table_like_mut) {
+        if let Some(battery) = document
+            .get_mut("battery")
+            .and_then(Item::as_table_like_mut)
+        {
             self.battery(battery);
         }
         if !self.effects.is_empty() {
@@ -67,7 +70,10 @@ impl Extension<'_> {
     }
 
     fn wrong(&self, what: &str) -> Failure {
-        Failure::Input(format!("{}: {what}, expected tables [effects.<id>]", self.source))
+        Failure::Input(format!(
+            "{}: {what}, expected tables [effects.<id>]",
+            self.source
+        ))
     }
 
     fn effects(&self, document: &mut DocumentMut) -> Result<(), Failure> {
@@ -86,7 +92,11 @@ impl Extension<'_> {
                 // Written in full: reading it back gives the same number.
                 table.insert(name, value(*number));
             }
-            let comment: String = effect.comment.iter().map(|line| format!("# {line}\n")).collect();
+            let comment: String = effect
+                .comment
+                .iter()
+                .map(|line| format!("# {line}\n"))
+                .collect();
             table.decor_mut().set_prefix(format!("\n{comment}"));
             place.insert(&effect.id, Item::Table(table));
         }
@@ -94,7 +104,10 @@ impl Extension<'_> {
     }
 
     fn battery(&self, table: &mut dyn TableLike) {
-        let file = table.get("ocv_file").and_then(Item::as_str).map(PathBuf::from);
+        let file = table
+            .get("ocv_file")
+            .and_then(Item::as_str)
+            .map(PathBuf::from);
         if let Some(file) = file.filter(|file| file.is_relative())
             && let Some(from_there) = relative(&self.from.join(file), self.to)
         {
@@ -104,7 +117,11 @@ impl Extension<'_> {
             return;
         };
         if let Some(soc) = battery.initial_soc.filter(|_| self.shift.soc != 0.0) {
-            set(table, "initial_soc", value((soc + self.shift.soc).clamp(0.0, 1.0)));
+            set(
+                table,
+                "initial_soc",
+                value((soc + self.shift.soc).clamp(0.0, 1.0)),
+            );
         }
         if self.shift.resistance != 0.0 {
             let resistance = battery.resistance_ohm * (1.0 + self.shift.resistance);

@@ -22,7 +22,10 @@ impl<'a> Places<'a> {
 
     /// Keys of a table in the order of the file.
     pub(super) fn order(&self, table: &str) -> Vec<String> {
-        let table = self.document.as_ref().and_then(|document| document.get(table));
+        let table = self
+            .document
+            .as_ref()
+            .and_then(|document| document.get(table));
         let table = table.and_then(Item::as_table_like);
         table.map_or_else(Vec::new, |table| {
             table.iter().map(|(key, _)| key.to_owned()).collect()

@@ -3,13 +3,19 @@
 use crate::effects::{Effect, LIBRARY, Parameter, Stage};
 
 fn all(id: &str) -> impl Iterator<Item = &'static dyn Effect> {
-    LIBRARY.iter().copied().filter(move |effect| effect.card().id == id)
+    LIBRARY
+        .iter()
+        .copied()
+        .filter(move |effect| effect.card().id == id)
 }
 
 /// An effect's id, and the sets of parameters that it comes with (polarisation has one, two or three branches).
 pub fn find(id: &str) -> Option<(&'static str, Vec<&'static [Parameter]>)> {
     let known = all(id).next()?.card().id;
-    Some((known, all(id).map(|effect| effect.card().parameters).collect()))
+    Some((
+        known,
+        all(id).map(|effect| effect.card().parameters).collect(),
+    ))
 }
 
 /// Ids in the order of the documentation.

@@ -72,8 +72,16 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             }
             None => series::every_row(&drive, &parts.rows),
         };
-        let cells = if name == PACK { f64::from(battery.cells) } else { 1.0 };
-        let ocv: Vec<(f64, f64)> = battery.ocv.iter().map(|(soc, v)| (*soc, v * cells)).collect();
+        let cells = if name == PACK {
+            f64::from(battery.cells)
+        } else {
+            1.0
+        };
+        let ocv: Vec<(f64, f64)> = battery
+            .ocv
+            .iter()
+            .map(|(soc, v)| (*soc, v * cells))
+            .collect();
         let mut base = BatteryBase {
             capacity_ah: battery.capacity_ah,
             efficiency: battery.efficiency,
@@ -86,7 +94,17 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
         if work.purpose == Purpose::Compare {
             checks::battery(view, &drive, &observed, &base, name, &current)?;
         }
-        start(work, &mut base, &drive, &parts.rows, &parts.clocks, &observed, view, battery, name);
+        start(
+            work,
+            &mut base,
+            &drive,
+            &parts.rows,
+            &parts.clocks,
+            &observed,
+            view,
+            battery,
+            name,
+        );
         let (noise, accuracy) = match view {
             View::StateOfCharge => (battery.noise_pct, battery.accuracy_pct),
             _ => (battery.noise_v, battery.accuracy_v),
@@ -147,7 +165,8 @@ fn start(
             end - ah * efficiency / battery.capacity_ah
         } else if let Some(stated) = battery.initial_soc.filter(|_| clocks[index] == 0) {
             stated
-        } else if let Some((soc, uncertainty)) = seen(base, drive, own.start, observed, index, view) {
+        } else if let Some((soc, uncertainty)) = seen(base, drive, own.start, observed, index, view)
+        {
             sigma = sigma.max(uncertainty);
             work.remark(format!(
                 "initial_soc is not stated: {:.1} % ± {:.1} % taken from the first reading of {name}{}",

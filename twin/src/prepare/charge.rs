@@ -44,10 +44,16 @@ pub(super) fn item(
         ),
     };
     let interval_s = spec.interval_s.unwrap_or(INTERVAL_S);
-    let largest = drive.reference.iter().fold(0.0_f64, |most, i| most.max(i.abs()));
-    let (drive, observed, rows, resets) = differences(drive, &readings, &rows, interval_s, step_c, largest);
+    let largest = drive
+        .reference
+        .iter()
+        .fold(0.0_f64, |most, i| most.max(i.abs()));
+    let (drive, observed, rows, resets) =
+        differences(drive, &readings, &rows, interval_s, step_c, largest);
     if resets > 0 {
-        work.remark(format!("{column} was set anew {resets} times; each begins a new stretch"));
+        work.remark(format!(
+            "{column} was set anew {resets} times; each begins a new stretch"
+        ));
     }
     let spacing_s = series::spacing_s(&observed).max(f64::MIN_POSITIVE);
     let noise_c = (spec.noise_c.powi(2) + step_c * step_c / 12.0).sqrt();
@@ -111,8 +117,16 @@ fn differences(
     // Segments are renumbered where one is cut.
     let mut shift = 0;
     let mut last: Option<(usize, f64, f64)> = None;
-    for (index, row) in rows.iter().enumerate().filter(|(index, _)| readings.valid[*index]) {
-        let (segment, now_s, charge) = (readings.segment[index], readings.t_s[index], readings.value[index]);
+    for (index, row) in rows
+        .iter()
+        .enumerate()
+        .filter(|(index, _)| readings.valid[*index])
+    {
+        let (segment, now_s, charge) = (
+            readings.segment[index],
+            readings.t_s[index],
+            readings.value[index],
+        );
         let mut mean = f64::NAN;
         if let Some((before, before_s, before_c)) = last
             && before == segment

@@ -56,10 +56,12 @@ pub(super) fn enough(problem: &Problem, source: &str) -> Result<(), Failure> {
         .count();
     if rows == 0 && outside > 0 && !drive.is_empty() {
         let span = |t_s: &[f64]| {
-            let (low, high) = t_s.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), t| {
-                (low.min(*t), high.max(*t))
-            });
-            format!("{low} … {high} s")
+            let (low, high) = t_s
+                .iter()
+                .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), t| {
+                    (low.min(*t), high.max(*t))
+                });
+            format!("{} … {} s", shown(low), shown(high))
         };
         return Err(Failure::Input(format!(
             "{source}, column {}: found readings at {} and a reference at {}, expected both at the same time",
@@ -72,6 +74,11 @@ pub(super) fn enough(problem: &Problem, source: &str) -> Result<(), Failure> {
         "{source}, column {}: found {rows} readings to compare, expected at least {FEWEST_ROWS}",
         problem.name
     )))
+}
+
+/// A time without the digits that a sum of steps leaves behind.
+fn shown(t_s: f64) -> f64 {
+    (t_s * 1e6).round() / 1e6
 }
 
 /// Readings that count with the reference at their time.
@@ -108,7 +115,11 @@ fn at(drive: &Drive, segment: usize, t_s: f64) -> f64 {
 
 /// Distance between the 2nd and the 98th percentile.
 fn spread(values: &[f64]) -> f64 {
-    let mut sorted: Vec<f64> = values.iter().copied().filter(|value| value.is_finite()).collect();
+    let mut sorted: Vec<f64> = values
+        .iter()
+        .copied()
+        .filter(|value| value.is_finite())
+        .collect();
     if sorted.len() < 2 {
         return 0.0;
     }
@@ -164,7 +175,11 @@ pub(super) fn pair(
     }
     let (spread_x, spread_y) = (spread(&x), spread(&y));
     if let Some(power) = thousands(spread_x / spread_y) {
-        let (large, small) = if power > 0 { (reference, measured) } else { (measured, reference) };
+        let (large, small) = if power > 0 {
+            (reference, measured)
+        } else {
+            (measured, reference)
+        };
         let factor = 1000_f64.powi(power.abs());
         return Err(Failure::Input(format!(
             "{large} moves by {:.4} and {small} by {:.4}, a factor near {factor}: found two units, expected the same \
@@ -203,8 +218,15 @@ pub(super) fn plausible(
         ));
     }
     if let Some(full_scale) = sensor.full_scale {
-        let beyond = drive.reference.iter().filter(|i| i.abs() > full_scale).count();
-        let most = drive.reference.iter().fold(0.0_f64, |most, i| most.max(i.abs()));
+        let beyond = drive
+            .reference
+            .iter()
+            .filter(|i| i.abs() > full_scale)
+            .count();
+        let most = drive
+            .reference
+            .iter()
+            .fold(0.0_f64, |most, i| most.max(i.abs()));
         if beyond > 0 {
             remarks.push(format!(
                 "{reference} is beyond the sensor's full scale of {full_scale} in {beyond} of {} rows, at most {most}",
@@ -220,9 +242,11 @@ pub(super) fn plausible(
 
 /// Readings that stand at their highest or lowest value while the reference moves.
 fn clipped(x: &[f64], y: &[f64], measured: &str) -> Vec<String> {
-    let (low, high) = y.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
-        (low.min(*value), high.max(*value))
-    });
+    let (low, high) = y
+        .iter()
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
+            (low.min(*value), high.max(*value))
+        });
     let mut remarks = Vec::new();
     for (end, what) in [(high, "highest"), (low, "lowest")] {
         let inside: Vec<f64> = x
@@ -252,14 +276,22 @@ fn spikes(drive: &Drive, observed: &Observed, reference: &str) -> Option<String>
     let mut steps: Vec<f64> = drive
         .segments
         .iter()
-        .flat_map(|rows| drive.reference[rows.clone()].windows(2).map(|pair| (pair[1] - pair[0]).abs()))
+        .flat_map(|rows| {
+            drive.reference[rows.clone()]
+                .windows(2)
+                .map(|pair| (pair[1] - pair[0]).abs())
+        })
         .collect();
     let typical = median(&mut steps)?;
     let wide = spread(&drive.reference);
     let mut found = Vec::new();
     for rows in &drive.segments {
         for row in rows.start + 1..rows.end.saturating_sub(1) {
-            let (before, now, after) = (drive.reference[row - 1], drive.reference[row], drive.reference[row + 1]);
+            let (before, now, after) = (
+                drive.reference[row - 1],
+                drive.reference[row],
+                drive.reference[row + 1],
+            );
             let jump = (now - before).abs().min((now - after).abs());
             let back = (now - before) * (now - after) > 0.0;
             let sensor = [row - 1, row, row + 1].map(|row| observed.value[row]);
@@ -342,7 +374,8 @@ pub(super) fn battery(
         )));
     }
     // From one reading to the next the slow open-circuit voltage hardly matters.
-    let steps = |values: &[f64]| -> Vec<f64> { values.windows(2).map(|pair| pair[1] - pair[0]).collect() };
+    let steps =
+        |values: &[f64]| -> Vec<f64> { values.windows(2).map(|pair| pair[1] - pair[0]).collect() };
     let together = correlation(&steps(&x), &steps(&y));
     if together > -OPPOSITE {
         return Err(Failure::Input(format!(

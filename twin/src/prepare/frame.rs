@@ -91,10 +91,19 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
         };
         name != "t_s" && has(&reference) && !has(&recording)
     });
-    let time: Vec<_> = rest.iter().filter(|(name, _)| name == "t_s").cloned().collect();
-    let time = time.into_iter().filter(|(_, column)| reference.column(column).is_some());
+    let time: Vec<_> = rest
+        .iter()
+        .filter(|(name, _)| name == "t_s")
+        .cloned()
+        .collect();
+    let time = time
+        .into_iter()
+        .filter(|(_, column)| reference.column(column).is_some());
     let to_reference: Vec<_> = to_reference.into_iter().chain(time).collect();
-    Ok((mapped(recording, &rest)?, Some(mapped(reference, &to_reference)?)))
+    Ok((
+        mapped(recording, &rest)?,
+        Some(mapped(reference, &to_reference)?),
+    ))
 }
 
 /// CSV or Parquet.

@@ -46,7 +46,10 @@ pub fn freshness(
     // Pairs of successive readings of one clock.
     let mut pairs = Vec::new();
     for clock in frame.clocks() {
-        let known: Vec<usize> = clock.clone().filter(|row| value[*row].is_finite()).collect();
+        let known: Vec<usize> = clock
+            .clone()
+            .filter(|row| value[*row].is_finite())
+            .collect();
         pairs.extend(known.windows(2).map(|pair| (pair[0], pair[1])));
     }
     let mut steps: Vec<f64> = pairs
@@ -83,7 +86,10 @@ pub fn freshness(
         moved += 1;
         repeated += usize::from(value[*before] == value[*after]);
     }
-    let mut apart: Vec<f64> = pairs.iter().map(|(before, after)| t_s[*after] - t_s[*before]).collect();
+    let mut apart: Vec<f64> = pairs
+        .iter()
+        .map(|(before, after)| t_s[*after] - t_s[*before])
+        .collect();
     let is_stated = median(&mut apart).is_some_and(|step_s| step_s < 0.75 * stated_s);
     let is_seen = moved >= 10 && repeated as f64 >= HELD_SHARE * moved as f64;
     if !is_stated && !is_seen {

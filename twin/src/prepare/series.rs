@@ -32,7 +32,10 @@ pub(super) fn drive(frame: &Frame, reference: &[f64]) -> DriveParts {
         clocks: Vec::new(),
     };
     for (clock, rows) in frame.clocks().iter().enumerate() {
-        let known: Vec<usize> = rows.clone().filter(|row| reference[*row].is_finite()).collect();
+        let known: Vec<usize> = rows
+            .clone()
+            .filter(|row| reference[*row].is_finite())
+            .collect();
         let t_s: Vec<f64> = known.iter().map(|row| time_s[*row]).collect();
         let first = parts.rows.len();
         let mut start = first;
@@ -47,7 +50,10 @@ pub(super) fn drive(frame: &Frame, reference: &[f64]) -> DriveParts {
             }
             start = end;
         }
-        parts.drive.reference.extend(known.iter().map(|row| reference[*row]));
+        parts
+            .drive
+            .reference
+            .extend(known.iter().map(|row| reference[*row]));
         parts.drive.t_s.extend(t_s);
         parts.rows.extend(known);
     }
@@ -70,7 +76,10 @@ fn gaps(t_s: &[f64]) -> Vec<usize> {
         let after = steps.get(index + 1).copied().unwrap_or(0.0);
         step > least && step > GAP_OF_NEIGHBOURS * before.max(after)
     };
-    (0..steps.len()).filter(|index| is_gap(*index)).map(|index| index + 1).collect()
+    (0..steps.len())
+        .filter(|index| is_gap(*index))
+        .map(|index| index + 1)
+        .collect()
 }
 
 /// Whether each row with a reading has a reference as well.
@@ -134,7 +143,9 @@ pub(super) fn own_rows(
     let mut observed = Observed::default();
     let mut rows = Vec::new();
     for (clock, own) in sensor_clocks.iter().enumerate() {
-        let segments: Vec<usize> = (0..clocks.len()).filter(|index| clocks[*index] == clock).collect();
+        let segments: Vec<usize> = (0..clocks.len())
+            .filter(|index| clocks[*index] == clock)
+            .collect();
         if segments.is_empty() {
             continue;
         }

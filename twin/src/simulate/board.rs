@@ -13,9 +13,7 @@ use core_logic::{
         Adc1Sample, Converter, ConverterCoefficients, ConverterSample, Corrections, SampleContext,
     },
     design_parameters as design,
-    front_end::{
-        Channel, ClosedLoop, DualRange, FrontEnd, Hah1bv, KeyFactors, Network, PerRange,
-    },
+    front_end::{Channel, ClosedLoop, DualRange, FrontEnd, Hah1bv, KeyFactors, Network, PerRange},
     meter::{LONGEST_INTERVAL, MeterChannel, MeterReading},
     range::{EdgeRecorder, Range as SensorRange},
     sliding_average::{SlidingAverage, SlidingAverageConfig},
@@ -122,7 +120,8 @@ impl Board {
         let zero_v = front_end.line(SensorRange::Small, supply).zero_nanovolts as f64 * 1e-9;
         // The comparators stand on the small sensor.
         let per_v = full_scale_a.small / small;
-        let threshold_a = (comparators.high_v - f64::from(design::SENSOR_ZERO.get()) * 1e-6) * per_v;
+        let threshold_a =
+            (comparators.high_v - f64::from(design::SENSOR_ZERO.get()) * 1e-6) * per_v;
         let bits = configuration.converter.data_rate.bits();
         let codes_per_v = match front_end.channel() {
             Channel::Ads1100 => f64::from(1_u32 << (bits - 1)) / (f64::from(supply.get()) * 1e-6),
@@ -181,7 +180,10 @@ impl Board {
 
     /// Charge of one count in the small range, in C.
     pub fn charge_step_c(&self) -> f64 {
-        let charge = self.configuration.meter.charge_per_count(SensorRange::Small);
+        let charge = self
+            .configuration
+            .meter
+            .charge_per_count(SensorRange::Small);
         charge.get() as f64 * 1e-9
     }
 
@@ -191,7 +193,14 @@ impl Board {
     }
 
     /// What it reports at the rows of `observed`, driven by `drive`.
-    pub fn run(&self, drive: &Drive, held: bool, observed: &Observed, pace: Pace, charge: bool) -> Reported {
+    pub fn run(
+        &self,
+        drive: &Drive,
+        held: bool,
+        observed: &Observed,
+        pace: Pace,
+        charge: bool,
+    ) -> Reported {
         let rows = observed.t_s.len();
         let mut reported = Reported {
             current_a: vec![f64::NAN; rows],
@@ -205,7 +214,11 @@ impl Board {
             let end = (row..rows)
                 .find(|next| observed.segment[*next] != segment)
                 .unwrap_or(rows);
-            if let Some(inside) = drive.segments.get(segment).filter(|inside| !inside.is_empty()) {
+            if let Some(inside) = drive
+                .segments
+                .get(segment)
+                .filter(|inside| !inside.is_empty())
+            {
                 let pieces = self.pieces(drive, inside.clone(), held);
                 self.convert(&pieces, observed, row..end, pace, &mut reported);
                 if charge {
@@ -303,7 +316,8 @@ impl Board {
             return before_c;
         };
         let start_s = first.start_s;
-        let instant = |at_s: f64| Instant::from_ticks(((at_s - start_s) * 1e6).round().max(0.0) as u64);
+        let instant =
+            |at_s: f64| Instant::from_ticks(((at_s - start_s) * 1e6).round().max(0.0) as u64);
         let per_s = design::METER_COUNTS_PER_SECOND_Q32 as f64 / 2_f64.powi(32);
         let mut meter = MeterChannel::new(self.configuration.meter);
         let mut edges = EdgeRecorder::new(instant(start_s), first.range == SensorRange::Large);
@@ -415,7 +429,13 @@ impl Maker<'_> {
         for pair in cuts[..=count].windows(2) {
             let at = |share: f64| (from + (to - from) * share).clamp(-limit, limit);
             let time = |share: f64| from_s + (to_s - from_s) * share;
-            self.piece(time(pair[0]), at(pair[0]), time(pair[1]), at(pair[1]), range);
+            self.piece(
+                time(pair[0]),
+                at(pair[0]),
+                time(pair[1]),
+                at(pair[1]),
+                range,
+            );
         }
     }
 
@@ -537,7 +557,8 @@ impl<'a> Chain<'a> {
                 .any(|piece| piece.range != self.range);
         let volts = board.zero_v + mean * SIGNAL_SPAN_V;
         let code = (volts * board.codes_per_v).round();
-        let ticks = |at_s: f64| Instant::from_ticks(((at_s - self.clock_s) * 1e6).round().max(0.0) as u64);
+        let ticks =
+            |at_s: f64| Instant::from_ticks(((at_s - self.clock_s) * 1e6).round().max(0.0) as u64);
         let context = SampleContext {
             range: self.range,
             spoiled_by_edge: spoiled,
@@ -579,7 +600,11 @@ impl<'a> Chain<'a> {
                 .average(&board.average, reading.at)
                 .map_or(f64::NAN, |average| amps(average.current));
         } else {
-            self.value = if spoiled { f64::NAN } else { amps(reading.current) };
+            self.value = if spoiled {
+                f64::NAN
+            } else {
+                amps(reading.current)
+            };
         }
     }
 }

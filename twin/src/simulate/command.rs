@@ -98,9 +98,15 @@ pub fn columns(model: &Model, prepared: &Prepared) -> Vec<(String, Vec<f64>)> {
             _ => add(&item.problem.name, &item.rows, &predicted(item)),
         }
     }
-    let sensor = prepared.items.iter().find(|item| item.problem.view == View::Sensor);
+    let sensor = prepared
+        .items
+        .iter()
+        .find(|item| item.problem.view == View::Sensor);
     if let (Some(item), Some(charge)) = (sensor, counter(model, prepared)) {
-        let name = model.charge.as_ref().and_then(|charge| charge.column.clone());
+        let name = model
+            .charge
+            .as_ref()
+            .and_then(|charge| charge.column.clone());
         add(name.as_deref().unwrap_or("q_meas_c"), &item.rows, &charge);
     }
     columns
@@ -120,7 +126,10 @@ pub fn predicted(item: &Item) -> Vec<f64> {
 /// The charge counter, in C: the board's meter as designed, or the sum of the sensor's readings for a pair that says it
 /// has a counter.
 fn counter(model: &Model, prepared: &Prepared) -> Option<Vec<f64>> {
-    let item = prepared.items.iter().find(|item| item.problem.view == View::Sensor)?;
+    let item = prepared
+        .items
+        .iter()
+        .find(|item| item.problem.view == View::Sensor)?;
     let sensor = model.sensor.as_ref()?;
     let problem = &item.problem;
     if problem.unit != "A" {
@@ -128,7 +137,11 @@ fn counter(model: &Model, prepared: &Prepared) -> Option<Vec<f64>> {
     }
     if let Some(board) = Board::new(sensor.front_end, sensor.average.unwrap_or(1)) {
         let held = matches!(&problem.base, Base::Sensor(base) if base.held_reference);
-        return Some(board.run(&problem.drive, held, &problem.observed, item.pace, true).charge_c);
+        return Some(
+            board
+                .run(&problem.drive, held, &problem.observed, item.pace, true)
+                .charge_c,
+        );
     }
     let charge = model.charge.as_ref()?;
     let current = predicted(item);
@@ -143,7 +156,11 @@ fn counter(model: &Model, prepared: &Prepared) -> Option<Vec<f64>> {
                 sum += mean * h;
             }
         }
-        if step > 0.0 { (sum / step).floor() * step } else { sum }
+        if step > 0.0 {
+            (sum / step).floor() * step
+        } else {
+            sum
+        }
     });
     Some(counted.collect())
 }
