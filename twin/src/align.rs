@@ -307,9 +307,9 @@ fn derivative(signal: &Signal, grid_s: f64) -> Vec<f64> {
         means[cell] = sum[cell] / f64::from(count[cell]);
         if let Some(before) = known {
             let (from, to) = (means[before], means[cell]);
-            for between in before + 1..cell {
-                means[between] =
-                    from + (to - from) * (between - before) as f64 / (cell - before) as f64;
+            let cells = (cell - before) as f64;
+            for (index, mean) in means[before + 1..cell].iter_mut().enumerate() {
+                *mean = from + (to - from) * (index + 1) as f64 / cells;
             }
         }
         known = Some(cell);

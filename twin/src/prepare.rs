@@ -20,7 +20,7 @@ pub use held::{Freshness, freshness};
 use crate::{
     align, explain,
     failure::Failure,
-    model::{FrontEndKind, Model, Sensor, registry},
+    model::{Model, Sensor, registry},
     problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View},
     simulate::board::{Board, Pace},
 };
@@ -206,7 +206,7 @@ impl Work<'_> {
         };
         if self.purpose == Purpose::Compare && value.is_some() {
             let (errors, remarks) = (
-                checks::pair(&drive, &observed, sensor, &reference, &measured),
+                checks::pair(&drive, &observed, &reference, &measured),
                 checks::plausible(&drive, &observed, sensor, &reference, &measured),
             );
             for remark in remarks {
@@ -472,9 +472,14 @@ impl Work<'_> {
         fresh: &Freshness,
     ) -> (Observed, Vec<usize>) {
         match (&self.clock, self.reference) {
-            (Some(clock), Some(_)) => {
-                series::own_rows(drive, clocks, &[0..clock.len()], clock, value, &fresh.rows)
-            }
+            (Some(clock), Some(_)) => series::own_rows(
+                drive,
+                clocks,
+                self.frame.clocks(),
+                clock,
+                value,
+                &fresh.rows,
+            ),
             _ => {
                 let frame = self.frame;
                 if series::share_rows(rows, value) {
@@ -534,11 +539,6 @@ fn model_effects(model: &Model, problem: &mut Problem) {
     for (reading, (with, without)) in base.reading.iter_mut().zip(with.iter().zip(&without)) {
         *reading += with - without;
     }
-}
-
-/// Whether a front end is one of the board's.
-pub fn is_board(kind: FrontEndKind) -> bool {
-    kind != FrontEndKind::Pair
 }
 
 /// A time in a remark.

@@ -1,6 +1,8 @@
 //! The board as designed against the firmware's own composition, and the simulation against the one that explains.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+// A drive of one segment is a list of one range.
+#![allow(clippy::single_range_in_vec_init)]
 
 #[path = "../../core-logic/tests/support/host_board.rs"]
 mod host_board;

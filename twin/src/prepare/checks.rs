@@ -165,7 +165,6 @@ fn thousands(ratio: f64) -> Option<i32> {
 pub(super) fn pair(
     drive: &Drive,
     observed: &Observed,
-    _sensor: &Sensor,
     reference: &str,
     measured: &str,
 ) -> Result<(), Failure> {
