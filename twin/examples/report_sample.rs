@@ -24,7 +24,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     ] {
         fs::write(folder.join(format!("{name}.html")), html::render(&report))?;
         fs::write(folder.join(format!("{name}.json")), json::render(&report))?;
-        fs::write(folder.join(format!("{name}.txt")), text::render(&report, 80))?;
+        fs::write(
+            folder.join(format!("{name}.txt")),
+            text::render(&report, 80),
+        )?;
     }
     Ok(())
 }

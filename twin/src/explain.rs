@@ -217,7 +217,9 @@ fn one(
         });
     }
     report.models.push(fitted(problem, &selection.fit));
-    report.plots.push(plots(&bench, &selection.fit, &held_residual));
+    report
+        .plots
+        .push(plots(&bench, &selection.fit, &held_residual));
     let sentence = sentence(&bench, &selection, verdict, left, report);
     Part {
         verdict,
@@ -377,6 +379,7 @@ fn effects(bench: &Workbench<'_>, selection: &Selection, seed: u64) -> Vec<Effec
                     ci95: intervals[named.index][p],
                     off: Some(parameter.off).filter(|off| off.is_finite()),
                     unit: unit(bench.problem, parameter.unit),
+                    off: parameter.off.is_finite().then_some(parameter.off),
                 })
                 .collect();
             let separated: Vec<&str> = named

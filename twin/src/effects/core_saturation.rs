@@ -32,7 +32,8 @@ impl Effect for CoreSaturation {
         if parameter == 0 {
             (0.02 * scale.largest, 1.05 * scale.largest)
         } else {
-            (0.02, 20.0)
+            // Softer than a corner: a hard limit is no core.
+            (0.2, 20.0)
         }
     }
 

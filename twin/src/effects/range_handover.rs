@@ -1,6 +1,6 @@
 //! Memory of the multiplier at a change of range.
 
-use super::scene::{Scale, Scene, low_pass};
+use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, sensing, spaced};
 use crate::problem::Problem;
 
@@ -15,7 +15,10 @@ static CARD: Card = Card {
     id: "range-handover",
     statement: "After a change of range the multiplier's low-pass still holds the old range's product, which is counted at the new range's scale.",
     equation: "y = i + (S·LP(i/S) − LP(i)), S = scale of the range in use, LP: first order with τ",
-    parameters: &[Parameter::new("tau_s", "s", 0.0, Search::Logarithmic)],
+    parameters: &[
+        Parameter::new("tau_s", "s", 0.0, Search::Logarithmic),
+        Parameter::internal("since_s", "s", 0.0, Search::Smooth),
+    ],
     shows: "at each change of the range flag",
     looks_like: &[],
     separated_by: "many changes of range at a large current",
@@ -36,14 +39,18 @@ impl Effect for RangeHandover {
                 .is_some_and(|flag| flag.iter().any(|f| *f > 0.5) && flag.iter().any(|f| *f < 0.5))
     }
 
-    fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
-        (0.01 * scale.step_s, 0.1 * scale.span_s)
+    fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64) {
+        if parameter == 0 {
+            (0.01 * scale.step_s, 0.1 * scale.span_s)
+        } else {
+            (0.0, scale.step_s)
+        }
     }
 
     fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
         spaced(0.05 * scale.step_s, 30.0 * scale.step_s, 8)
             .into_iter()
-            .map(|tau| vec![tau])
+            .map(|tau| vec![tau, 0.3 * scale.step_s])
             .collect()
     }
 
@@ -53,18 +60,34 @@ impl Effect for RangeHandover {
         let drive = scene.drive;
         if let Some(flag) = &drive.range_high {
             let scale = |row: usize| if flag[row] > 0.5 { ratio } else { 1.0 };
-            let scaled: Vec<f64> = scene
-                .signal
-                .iter()
-                .enumerate()
-                .map(|(row, value)| value / scale(row))
-                .collect();
-            // The range changes with a step: what is held between samples is the input of the old range.
-            let memory = low_pass(&drive.t_s, &drive.segments, &scaled, values[0], true);
-            let plain = low_pass(&drive.t_s, &drive.segments, &scene.signal, values[0], true);
-            for (row, value) in scene.signal.iter_mut().enumerate() {
-                *value += scale(row) * memory[row] - plain[row];
+            let input = &scene.signal;
+            let mut output = input.clone();
+            for rows in &drive.segments {
+                // Error of the product in the low-pass, in the scale of the range in use.
+                let mut error = 0.0;
+                let mut plain = rows.clone().next().map_or(0.0, |row| input[row]);
+                for row in rows.clone().skip(1) {
+                    let h = drive.t_s[row] - drive.t_s[row - 1];
+                    let kept = if h > 0.0 { (-h / values[0]).exp() } else { 1.0 };
+                    let ramp = if h > 0.0 {
+                        1.0 - values[0] / h * (1.0 - kept)
+                    } else {
+                        0.0
+                    };
+                    plain = kept * plain
+                        + (1.0 - kept) * input[row - 1]
+                        + (input[row] - input[row - 1]) * ramp;
+                    error *= kept;
+                    let change = scale(row) / scale(row - 1);
+                    if change != 1.0 {
+                        // What the low-pass holds is read at another scale from here on.
+                        // It began some time before this row.
+                        error = (change * (plain + error) - plain) * (-values[1] / values[0]).exp();
+                    }
+                    output[row] += error;
+                }
             }
+            scene.signal = output;
         }
     }
 }

@@ -1,7 +1,9 @@
 //! Only a part of each period is measured.
 
 use super::scene::{Cursor, Scale, Scene, integral};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+use crate::spectrum;
+
+use super::{Card, Clues, Effect, Parameter, Search, Stage};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -12,9 +14,9 @@ static CARD: Card = Card {
     statement: "The sensor measures only the first part of each period and holds that mean until the next one.",
     equation: "y = mean of i over the first duty·period of each period, held until the next (periods count from the recording's start)",
     parameters: &[
-        Parameter::new("period_s", "s", 0.0, Search::Logarithmic),
-        Parameter::new("duty", "1", 1.0, Search::Logarithmic),
-        Parameter::internal("phase_s", "s", 0.0, Search::Smooth),
+        Parameter::new("period_s", "s", 0.0, Search::Stepped),
+        Parameter::new("duty", "1", 1.0, Search::Stepped),
+        Parameter::internal("phase_s", "s", 0.0, Search::Stepped),
     ],
     shows: "beats with periodic loads",
     looks_like: &["moving-average", "gain"],
@@ -29,23 +31,42 @@ impl Effect for SampledWindow {
 
     fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64) {
         match parameter {
-            0 => (1.5 * scale.step_s, 0.1 * scale.span_s),
+            0 => (2.5 * scale.step_s, 0.1 * scale.span_s),
             1 => (0.01, 1.0),
             _ => (-scale.span_s, scale.span_s),
         }
     }
 
-    fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
-        spaced(
-            2.0 * scale.step_s.max(0.5 * scale.reading_step_s),
-            100.0 * scale.step_s,
-            14,
-        )
-        .into_iter()
-        .chain([1.0, 2.0, 5.0, 10.0].map(|times| times * scale.reading_step_s))
-        .filter(|period| *period > 1.5 * scale.step_s)
-        .flat_map(|period| [0.1, 0.25, 0.5, 1.0].map(|duty| vec![period, duty, 0.0]))
-        .collect()
+    fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        // A held reading moves at one phase of each period only: its squared steps have lines at the rate of the updates.
+        let moves: Vec<f64> = std::iter::once(0.0)
+            .chain(
+                clues
+                    .observed
+                    .windows(2)
+                    .map(|pair| (pair[1] - pair[0]).abs()),
+            )
+            .collect();
+        let (lowest, highest) = self.bounds(0, scale);
+        let mut starts = Vec::new();
+        for line in spectrum::lines(clues.t_s, &moves, scale.reading_step_s) {
+            for multiple in [1.0, 2.0] {
+                let period = multiple / line.frequency_hz;
+                if !(lowest..=highest).contains(&period) {
+                    continue;
+                }
+                // The sine of the line is largest when the reading moves, which is when a window ends.
+                let turn = std::f64::consts::FRAC_PI_2 - line.phase_rad;
+                let moved_s =
+                    turn / (std::f64::consts::TAU * line.frequency_hz) - 0.5 * scale.reading_step_s;
+                for duty in [0.1, 0.25, 0.4, 0.55, 0.75, 1.0] {
+                    starts.push(vec![period, duty, 0.0]);
+                    let phase = (moved_s - duty * period - clues.t_s[0]).rem_euclid(period);
+                    starts.push(vec![period, duty, phase]);
+                }
+            }
+        }
+        starts
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

@@ -212,7 +212,7 @@ fn coordinates(bench: &Workbench<'_>, model: &Model) -> Vec<(Coordinate, f64, f6
 fn step_of(bench: &Workbench<'_>, name: &str, value: f64, low: f64, high: f64) -> f64 {
     let scale = &bench.scale;
     match name {
-        "delay_s" | "phase_s" => 0.02 * scale.step_s,
+        "delay_s" | "since_s" => 0.02 * scale.step_s,
         "skew_ppm" => (0.02 * scale.step_s / scale.span_s.max(1e-9)) * 1e6,
         "frequency_hz" => 0.01 / scale.span_s.max(1e-9),
         "phase_rad" => 1e-3,
@@ -462,12 +462,22 @@ fn search_steps(
             .enumerate()
             .filter(|(_, parameter)| parameter.search == Search::Stepped)
         {
-            for share in [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4] {
+            for share in [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5] {
                 for _ in 0..4 {
                     let mut better = false;
                     for sign in [1.0, -1.0] {
                         let mut moved = model.clone();
-                        moved.members[m].values[p] *= 1.0 + sign * share;
+                        let values = &mut moved.members[m].values;
+                        // A phase may be zero: it moves by shares of its period.
+                        values[p] += sign
+                            * share
+                            * if values[p] == 0.0 {
+                                values[0]
+                            } else {
+                                values[p]
+                            };
+                        let (low, high) = effect.bounds(p, &bench.scale);
+                        values[p] = values[p].clamp(low, high);
                         let there_predicted = bench.run(&moved);
                         let there_residual = bench.residual(&there_predicted);
                         let there = cost(bench, &moved, &there_residual, sigma, used);
@@ -523,9 +533,9 @@ pub fn blocked(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Blocked {
     }
 }
 
-/// Loss of each block under a model whose values come from the other blocks only (one Gauss–Newton step from the whole fit,
+/// Loss of each row of each block under a model whose values come from the other blocks only (one Gauss–Newton step from the whole fit,
 /// exact where the simulation is linear in its values), in units of sigma².
-pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<f64> {
+pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<Vec<f64>> {
     let blocked = blocked(bench, fit, sigma);
     let size = blocked.slope.len();
     let mut total = DMatrix::zeros(size, size);
@@ -560,7 +570,7 @@ pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<f64> {
                         .sum();
                     huber((fit.residual[row] - moved) / sigma)
                 })
-                .sum()
+                .collect()
         })
         .collect()
 }

@@ -19,7 +19,7 @@ use crate::effects::{Effect, Search};
 pub const DRAWS: usize = 200;
 /// Rows that signatures are compared over; longer recordings are thinned out.
 const MOST_ROWS: usize = 30_000;
-/// A residual moved to where a candidate looks like itself again (a periodic load) is no placebo for it.
+/// A residual moved to where a candidate looks like itself again is no placebo for it: signs are drawn then.
 const ITSELF: f64 = 0.6;
 
 /// A candidate with the values from which its signature was taken.
@@ -266,44 +266,76 @@ fn placebos(
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let least = count / 20;
     let span = (count - 2 * least).max(1) as u32;
-    // The best candidates are what the placebos have to be different from.
-    let leaders: Vec<&Vec<f64>> = entries
-        .iter()
-        .take(3)
-        .filter_map(|entry| entry.columns.first())
+    let tries: Vec<Try> = (0..draws)
+        .map(|_| Try {
+            by: least + (random.next_u32() % span) as usize,
+            reversed: random.next_u32().is_multiple_of(2),
+            signs: blocks
+                .iter()
+                .map(|_| {
+                    if random.next_u32().is_multiple_of(2) {
+                        1.0
+                    } else {
+                        -1.0
+                    }
+                })
+                .collect(),
+        })
         .collect();
-    let mut tries = Vec::with_capacity(draws);
-    for _ in 0..4 * draws {
-        if tries.len() == draws {
-            break;
-        }
-        let by = least + (random.next_u32() % span) as usize;
-        let reversed = random.next_u32().is_multiple_of(2);
-        let itself = leaders.iter().any(|column| {
-            let moved = turned(column, by, reversed);
-            let size = dot(column, column);
-            size > 0.0 && (dot(column, &moved) / size).abs() > ITSELF
-        });
-        if !itself {
-            tries.push((by, reversed));
-        }
-    }
     let mut best: Vec<f64> = tries
         .into_par_iter()
-        .map(|(by, reversed)| {
-            let moved = turned(residual, by, reversed);
+        .map(|this| {
+            let moved = turned(residual, this.by, this.reversed);
             entries
                 .iter()
-                .map(|entry| gain(entry, &moved, blocks))
+                .map(|entry| {
+                    let itself = entry.columns.iter().any(|column| {
+                        let size = dot(column, column);
+                        (dot(column, &turned(column, this.by, this.reversed)) / size).abs() > ITSELF
+                    });
+                    if itself {
+                        flipped(entry, residual, blocks, &this.signs)
+                    } else {
+                        gain(entry, &moved, blocks)
+                    }
+                })
                 .fold(0.0, f64::max)
         })
         .collect();
     best.sort_unstable_by(f64::total_cmp);
-    // Without enough draws nothing can be said: then nothing passes.
-    if best.len() < draws / 4 {
-        return f64::INFINITY;
-    }
     best[(best.len() * 99).div_ceil(100).min(best.len()) - 1]
+}
+
+/// The gain of an entry when each block has a sign of its own: for signatures that stay like themselves when they are moved
+/// (a constant, a slow drift, a periodic load), where only being the same in every block tells them from chance.
+fn flipped(
+    entry: &Entry,
+    residual: &[f64],
+    blocks: &[std::ops::Range<usize>],
+    signs: &[f64],
+) -> f64 {
+    let size = entry.columns.len();
+    let rights: Vec<DVector<f64>> = blocks
+        .iter()
+        .zip(signs)
+        .map(|(rows, sign)| {
+            DVector::from_fn(size, |k, _| {
+                sign * dot(&entry.columns[k][rows.clone()], &residual[rows.clone()])
+            })
+        })
+        .collect();
+    let all: f64 = blocks
+        .iter()
+        .map(|rows| dot(&residual[rows.clone()], &residual[rows.clone()]))
+        .sum();
+    held_out_gain(&entry.grams, &rights) / all.max(1e-300)
+}
+
+/// One placebo draw.
+struct Try {
+    by: usize,
+    reversed: bool,
+    signs: Vec<f64>,
 }
 
 /// Moved around by some rows, reversed first if asked for.

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::fit::{Fit, fit, held_out};
+use super::fit::{Fit, fit, held_out, huber};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search, find};
@@ -18,6 +18,12 @@ const STARTS: usize = 2;
 const FLOOR: f64 = 0.04;
 /// Rows where an effect changes the reading by at least this share of its largest change are where it acts.
 const ACTS: f64 = 0.2;
+/// So many others that would do as well make an effect nameless if it is small.
+const VAGUE: usize = 3;
+/// Share of the held-out error below which an effect is small.
+const SMALL: f64 = 0.2;
+/// Stretches over which two models' losses are compared.
+const STRETCHES: usize = 200;
 /// A model is beaten if another's held-out loss is lower by this many standard errors of their paired difference.
 const BEATEN: f64 = 2.0;
 
@@ -49,11 +55,11 @@ pub struct Selection {
     pub refused: Vec<String>,
 }
 
-/// Held-out loss of a fit by block, and in all.
+/// Held-out loss of a fit by row, and in all.
 fn losses(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> (Vec<f64>, f64) {
-    let blocks = held_out(bench, fit, sigma);
-    let all = blocks.iter().sum();
-    (blocks, all)
+    let rows = held_out(bench, fit, sigma).concat();
+    let all = rows.iter().sum();
+    (rows, all)
 }
 
 /// Share of the held-out loss that goes from one fit to a better one, in the spread of the first.
@@ -71,7 +77,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
     let mut refused = Vec::new();
     let mut step_p99: Vec<(&'static str, f64)> = Vec::new();
     let mut rounds = 0;
-    'grow: loop {
+    let (now, named) = loop {
         while now.model.members.len() < MOST_EFFECTS {
             let done = now.model.members.len() as f64;
             progress(
@@ -99,19 +105,33 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
         if let Some(leaner) = backward(bench, &now, &step_p99, &mut decisions) {
             now = leaner;
         }
-        match swap(bench, &now, &mut decisions) {
+        let others = swapped(bench, &now);
+        match swap(bench, &now, &others, &mut decisions) {
             // A better model may have room for another effect.
-            Some(better) if rounds < 3 => {
-                now = better;
-                continue 'grow;
+            Some(better) if rounds < 3 => now = better,
+            _ => {
+                progress(0.92, "asking which other effects would do as well");
+                let named = name(bench, &now, &others, &step_p99);
+                // Small, and as well explained by many others: that is structure, and no name.
+                let Some(vague) = named
+                    .iter()
+                    .find(|one| one.equivalent.len() >= VAGUE && one.held_out_gain < SMALL)
+                else {
+                    break (now, named);
+                };
+                refused.push(format!(
+                    "{}: takes {} of the held-out error, and so would any of {}",
+                    now.model.members[vague.index].id(),
+                    percent(vague.held_out_gain),
+                    vague.equivalent.join(", ")
+                ));
+                let now = fit(bench, &now.model.without(vague.index), None);
+                let others = swapped(bench, &now);
+                let named = name(bench, &now, &others, &step_p99);
+                break (now, named);
             }
-            Some(better) => now = better,
-            None => {}
         }
-        break;
-    }
-    progress(0.92, "asking which other effects would do as well");
-    let named = name(bench, &now, &step_p99);
+    };
     Selection {
         plain,
         fit: now,
@@ -178,6 +198,9 @@ fn step(
         let index = better.model.members.len() - 1;
         let id = better.model.members[index].id();
         let gain = share(bench, now, &better);
+        if only_aligns(bench, now, &better, index) {
+            continue;
+        }
         if gain <= screening.placebo_p99 {
             note(
                 refused,
@@ -463,22 +486,27 @@ fn swapped(bench: &Workbench<'_>, now: &Fit) -> Vec<(usize, Fit)> {
         .collect()
 }
 
-fn swap(bench: &Workbench<'_>, now: &Fit, decisions: &mut Vec<String>) -> Option<Fit> {
-    let others = swapped(bench, now);
+fn swap(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    others: &[(usize, Fit)],
+    decisions: &mut Vec<String>,
+) -> Option<Fit> {
     let sigma = others
         .iter()
         .map(|(_, fit)| fit.sigma)
         .fold(now.sigma, f64::min);
     let (_, here) = losses(bench, now, sigma);
     let (index, best, loss) = others
-        .into_iter()
-        .map(|(index, fit)| {
-            let loss = losses(bench, &fit, sigma).1;
-            (index, fit, loss)
-        })
+        .iter()
+        .map(|(index, fit)| (*index, fit, losses(bench, fit, sigma).1))
         .min_by(|a, b| a.2.total_cmp(&b.2))?;
     let last = best.model.members.len() - 1;
-    if loss >= here * (1.0 - 1e-3) || obstacle(bench, now, &best, last, 1.0).is_some() {
+    if loss >= here * (1.0 - 1e-3) {
+        return None;
+    }
+    let without = fit(bench, &best.model.without(last), None);
+    if only_aligns(bench, &without, best, last) || obstacle(bench, now, best, last, 1.0).is_some() {
         return None;
     }
     decisions.push(format!(
@@ -487,12 +515,16 @@ fn swap(bench: &Workbench<'_>, now: &Fit, decisions: &mut Vec<String>) -> Option
         best.model.members[last].id(),
         percent((here - loss) / here)
     ));
-    Some(best)
+    Some(best.clone())
 }
 
 /// What speaks for each effect, and what would have done as well.
-fn name(bench: &Workbench<'_>, now: &Fit, step_p99: &[(&'static str, f64)]) -> Vec<Named> {
-    let others = swapped(bench, now);
+fn name(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    others: &[(usize, Fit)],
+    step_p99: &[(&'static str, f64)],
+) -> Vec<Named> {
     (0..now.model.members.len())
         .map(|index| {
             let id = now.model.members[index].id();
@@ -519,17 +551,38 @@ fn name(bench: &Workbench<'_>, now: &Fit, step_p99: &[(&'static str, f64)]) -> V
         .collect()
 }
 
-/// Whether a model's held-out loss is higher than the chosen one's by more than chance, block against block.
+/// Whether a model's held-out loss is higher than the chosen one's by more than chance, stretch against stretch.
 fn beaten(bench: &Workbench<'_>, other: &Fit, chosen: &Fit) -> bool {
     let sigma = chosen.sigma.min(other.sigma);
     let (theirs, _) = losses(bench, other, sigma);
     let (ours, _) = losses(bench, chosen, sigma);
-    let count = ours.len() as f64;
-    let differences: Vec<f64> = theirs.iter().zip(&ours).map(|(a, b)| a - b).collect();
+    let rows = (ours.len() / STRETCHES).max(1);
+    let differences: Vec<f64> = theirs
+        .chunks(rows)
+        .zip(ours.chunks(rows))
+        .map(|(a, b)| a.iter().sum::<f64>() - b.iter().sum::<f64>())
+        .collect();
+    let count = differences.len() as f64;
     let mean = differences.iter().sum::<f64>() / count;
     let variance =
         differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
     mean > BEATEN * (variance / count).sqrt()
+}
+
+/// Whether a model owes what it gains to the alignment of samples that its effect sets free, and not to the effect.
+fn only_aligns(bench: &Workbench<'_>, before: &Fit, after: &Fit, index: usize) -> bool {
+    if after.model.nuisance.alignment_s == before.model.nuisance.alignment_s {
+        return false;
+    }
+    let aligned = bench.residual(&bench.run(&after.model.without(index)));
+    let loss = |residual: &[f64]| {
+        residual
+            .iter()
+            .map(|r| huber(r / before.sigma))
+            .sum::<f64>()
+    };
+    let (from, to) = (loss(&before.residual), loss(&after.residual));
+    from - loss(&aligned) > 0.5 * (from - to)
 }
 
 /// A share in percent, short.

@@ -26,13 +26,22 @@ pub fn significant(value: f64, digits: usize) -> String {
 /// `value` with at most `digits` significant digits: a limit of 3 is not 3.000.
 pub fn at_most(value: f64, digits: usize) -> String {
     let number = significant(value, digits);
-    let (mantissa, exponent) = number.split_once('e').map_or((number.as_str(), None), |(m, e)| (m, Some(e)));
-    let mantissa = if mantissa.contains('.') { mantissa.trim_end_matches('0').trim_end_matches('.') } else { mantissa };
-    exponent.map_or_else(|| mantissa.to_owned(), |exponent| format!("{mantissa}e{exponent}"))
+    let (mantissa, exponent) = number
+        .split_once('e')
+        .map_or((number.as_str(), None), |(m, e)| (m, Some(e)));
+    let mantissa = if mantissa.contains('.') {
+        mantissa.trim_end_matches('0').trim_end_matches('.')
+    } else {
+        mantissa
+    };
+    exponent.map_or_else(
+        || mantissa.to_owned(),
+        |exponent| format!("{mantissa}e{exponent}"),
+    )
 }
 
-/// A value and the ends of its interval, all to the place that half the interval resolves: with two digits below 3, else
-/// with one.
+/// A value and the ends of its interval, all to the place that half the interval resolves: with two digits if it
+/// begins with 1 to 4, else with one.
 pub fn with_interval(value: f64, interval: [f64; 2]) -> [String; 3] {
     let [low, high] = interval;
     let half = (high - low) / 2.0;
@@ -41,13 +50,14 @@ pub fn with_interval(value: f64, interval: [f64; 2]) -> [String; 3] {
     }
     let size = value.abs().max(low.abs()).max(high.abs());
     let half = format!("{half:.1e}");
-    let place = exponent_of(&half) - i32::from(half.starts_with(['1', '2']));
+    let place = exponent_of(&half) - i32::from(half.starts_with(['1', '2', '3', '4']));
     let exponent = exponent_of(&format!("{size:.1e}"));
     if !(-4..6).contains(&exponent) {
         let digits = (exponent - place).max(0) as usize;
         // One exponent for the three: they are read against each other.
         let scale = 10f64.powi(exponent);
-        return [value, low, high].map(|number| minus(format!("{:.digits$}e{exponent}", number / scale)));
+        return [value, low, high]
+            .map(|number| minus(format!("{:.digits$}e{exponent}", number / scale)));
     }
     let decimals = (-place).max(0) as usize;
     [value, low, high].map(|number| minus(format!("{number:.decimals$}")))
@@ -89,17 +99,18 @@ pub fn change(before: f64, after: f64) -> String {
     if change < -0.995 && after > 0.0 {
         return minus(format!("{:.1} %", (100.0 * change).max(-99.9)));
     }
-    format!("{sign}{}", percent(if change.abs() < 0.0005 { 0.0 } else { change }))
+    format!(
+        "{sign}{}",
+        percent(if change.abs() < 0.0005 { 0.0 } else { change })
+    )
 }
 
-/// `p < 0.001`, `p = 0.012`.
+/// A p-value: `< 0.001`, `0.012`.
 pub fn p_value(p: f64) -> String {
-    if !p.is_finite() {
-        "p unknown".to_owned()
-    } else if p < 0.001 {
-        "p < 0.001".to_owned()
+    if p < 0.001 {
+        "< 0.001".to_owned()
     } else {
-        format!("p = {}", significant(p, 2))
+        significant(p, 2)
     }
 }
 
@@ -138,8 +149,12 @@ pub fn meaning(verdict: Verdict) -> &'static str {
     match verdict {
         Verdict::NoMismatch => "Recording and simulation agree within noise and accuracy.",
         Verdict::Explained => "The effects named below account for the mismatch.",
-        Verdict::PartlyExplained => "The effects named below account for a part of the mismatch; structure is left.",
-        Verdict::Ambiguous => "Several models account for the mismatch equally well on this recording.",
+        Verdict::PartlyExplained => {
+            "The effects named below account for a part of the mismatch; structure is left."
+        }
+        Verdict::Ambiguous => {
+            "Several models account for the mismatch equally well on this recording."
+        }
         Verdict::Unknown => "There is a mismatch, and no model of the library accounts for it.",
     }
 }
@@ -212,12 +227,30 @@ mod tests {
 
     #[test]
     fn an_interval_decides_the_digits() {
-        assert_eq!(with_interval(0.501_9, [0.497_1, 0.507_2]), ["0.502", "0.497", "0.507"]);
-        assert_eq!(with_interval(0.484_8, [0.472_8, 0.498]), ["0.485", "0.473", "0.498"]);
-        assert_eq!(with_interval(1_203.7, [1_100.2, 1_310.9]), ["1204", "1100", "1311"]);
-        assert_eq!(with_interval(-0.004, [-0.013, 0.005]), ["−0.004", "−0.013", "0.005"]);
-        assert_eq!(with_interval(3.21e-7, [3.0e-7, 3.4e-7]), ["3.21e-7", "3.00e-7", "3.40e-7"]);
-        assert_eq!(with_interval(2.0, [f64::NEG_INFINITY, 5.0]), ["2.000", NONE, "5.000"]);
+        assert_eq!(
+            with_interval(0.501_9, [0.497_1, 0.507_2]),
+            ["0.502", "0.497", "0.507"]
+        );
+        assert_eq!(
+            with_interval(0.484_8, [0.472_8, 0.498]),
+            ["0.485", "0.473", "0.498"]
+        );
+        assert_eq!(
+            with_interval(1_203.7, [1_100.2, 1_310.9]),
+            ["1204", "1100", "1311"]
+        );
+        assert_eq!(
+            with_interval(-0.004, [-0.013, 0.005]),
+            ["−0.004", "−0.013", "0.005"]
+        );
+        assert_eq!(
+            with_interval(3.21e-7, [3.0e-7, 3.4e-7]),
+            ["3.21e-7", "3.00e-7", "3.40e-7"]
+        );
+        assert_eq!(
+            with_interval(2.0, [f64::NEG_INFINITY, 5.0]),
+            ["2.000", NONE, "5.000"]
+        );
     }
 
     #[test]
@@ -229,8 +262,8 @@ mod tests {
         assert_eq!(change(0.5, 0.55), "+10 %");
         assert_eq!(change(1.0, 0.000_1), "−99.9 %");
         assert_eq!(change(0.0, 0.1), "");
-        assert_eq!(p_value(0.000_2), "p < 0.001");
-        assert_eq!(p_value(0.012), "p = 0.012");
+        assert_eq!(p_value(0.000_2), "< 0.001");
+        assert_eq!(p_value(0.012), "0.012");
         assert_eq!(grouped(36_000), "36,000");
         assert_eq!(grouped(999), "999");
         assert_eq!(at_most(3.0, 4), "3");

@@ -2,7 +2,10 @@
 
 use super::{
     data::{EffectReport, Location, ParameterReport, Report, SignalReport, Verdict},
-    format::{change, count, grouped, meaning, p_value, percent, place, quantity, significant, unit_of, verdict, with_interval},
+    format::{
+        change, count, grouped, meaning, p_value, percent, place, quantity, significant, unit_of,
+        verdict, with_interval,
+    },
     plots::{Pictures, Words, embed, pictures},
 };
 
@@ -38,8 +41,20 @@ pub fn render(report: &Report) -> String {
     before_and_after(&mut page, report, &drawn);
     holdouts(&mut page, report);
     unexplained(&mut page, report);
-    list(&mut page, "decisions", "How it was decided", &report.decisions, true);
-    list(&mut page, "remarks", "Remarks on the input", &report.remarks, false);
+    list(
+        &mut page,
+        "decisions",
+        "How it was decided",
+        &report.decisions,
+        true,
+    );
+    list(
+        &mut page,
+        "remarks",
+        "Remarks on the input",
+        &report.remarks,
+        false,
+    );
     page.push_str("</main>\n");
     foot(&mut page, report);
     let data: Vec<_> = drawn.iter().map(|(_, pictures)| &pictures.data).collect();
@@ -68,11 +83,39 @@ fn escape(text: &str) -> String {
     safe
 }
 
+/// A name of a column or parameter. Only a long one may be broken: `i_mea` and `s_a` on two lines are hard to read.
+fn code(name: &str) -> String {
+    let class = if name.chars().count() > 20 {
+        " class=\"long\""
+    } else {
+        ""
+    };
+    format!("<code{class}>{}</code>", escape(name))
+}
+
+/// The first cell of a row of text.
+fn row_head(text: &str) -> String {
+    let class = if text.chars().count() > 36 {
+        " class=\"long\""
+    } else {
+        ""
+    };
+    format!("<th scope=\"row\"{class}>{}</th>", escape(text))
+}
+
 fn head(page: &mut String, report: &Report) {
-    page.push_str("<header>\n<p class=\"kicker\">Why the recording and the simulation disagree</p>\n");
-    page.push_str(&format!("<h1>{}</h1>\n<dl class=\"files\">", escape(file_name(&report.inputs.recording))));
+    page.push_str(
+        "<header>\n<p class=\"kicker\">Why the recording and the simulation disagree</p>\n",
+    );
+    page.push_str(&format!(
+        "<h1>{}</h1>\n<dl class=\"files\">",
+        escape(file_name(&report.inputs.recording))
+    ));
     let mut entry = |what: &str, file: &str| {
-        page.push_str(&format!("<div><dt>{what}</dt><dd>{}</dd></div>", escape(file)));
+        page.push_str(&format!(
+            "<div><dt>{what}</dt><dd>{}</dd></div>",
+            escape(file)
+        ));
     };
     entry("Recording", &report.inputs.recording);
     entry("Model", &report.inputs.model);
@@ -86,7 +129,11 @@ fn head(page: &mut String, report: &Report) {
         ("before-after", "Before and after", true),
         ("holdouts", "Other files", !report.holdouts.is_empty()),
         ("unexplained", "Unexplained", true),
-        ("decisions", "How it was decided", !report.decisions.is_empty()),
+        (
+            "decisions",
+            "How it was decided",
+            !report.decisions.is_empty(),
+        ),
         ("remarks", "Remarks", !report.remarks.is_empty()),
     ] {
         if shown {
@@ -97,7 +144,9 @@ fn head(page: &mut String, report: &Report) {
 }
 
 fn file_name(path: &str) -> &str {
-    path.rsplit(['/', '\\']).find(|part| !part.is_empty()).unwrap_or(path)
+    path.rsplit(['/', '\\'])
+        .find(|part| !part.is_empty())
+        .unwrap_or(path)
 }
 
 /// The verdict, and for each signal the one pair of numbers that counts.
@@ -107,23 +156,38 @@ fn answer(page: &mut String, report: &Report) {
         Verdict::Explained => ("good", "✓"),
         Verdict::PartlyExplained => ("part", "◐"),
         Verdict::Ambiguous => ("part", "≟"),
-        Verdict::Unknown => ("open", "?"),
+        Verdict::Unknown => ("unknown", "?"),
     };
     page.push_str(&format!(
         "<section class=\"verdict {class}\" aria-labelledby=\"verdict\">\n<h2 id=\"verdict\"><span class=\"sign\" aria-hidden=\"true\">{sign}</span>{}</h2>\n",
         verdict(report.verdict)
     ));
-    let summary = if report.summary.trim().is_empty() { meaning(report.verdict) } else { report.summary.trim() };
+    let summary = if report.summary.trim().is_empty() {
+        meaning(report.verdict)
+    } else {
+        report.summary.trim()
+    };
     page.push_str(&format!("<p class=\"summary\">{}</p>\n", escape(summary)));
     page.push_str("<dl class=\"stats\">");
     for signal in &report.signals {
         let improved = change(signal.held_out_blocks_before, signal.held_out_blocks_after);
         page.push_str(&format!(
-            "<div><dt>Held-out error of <code>{}</code></dt><dd>{}<strong>{}</strong>{}</dd></div>",
-            escape(&signal.name),
-            if report.effects.is_empty() { String::new() } else { format!("{} → ", significant(signal.held_out_blocks_before, 3)) },
-            escape(&quantity(&significant(signal.held_out_blocks_after, 3), &signal.unit)),
-            if report.effects.is_empty() || improved.is_empty() { String::new() } else { format!(" <span class=\"change\">{improved}</span>") },
+            "<div><dt>Held-out error of {}</dt><dd>{}<strong>{}</strong>{}</dd></div>",
+            code(&signal.name),
+            if report.effects.is_empty() {
+                String::new()
+            } else {
+                format!("{} → ", significant(signal.held_out_blocks_before, 3))
+            },
+            escape(&quantity(
+                &significant(signal.held_out_blocks_after, 3),
+                &signal.unit
+            )),
+            if report.effects.is_empty() || improved.is_empty() {
+                String::new()
+            } else {
+                format!(" <span class=\"change\">{improved}</span>")
+            },
         ));
     }
     page.push_str("</dl>\n");
@@ -132,12 +196,22 @@ fn answer(page: &mut String, report: &Report) {
         return;
     }
     page.push_str("<ul class=\"named\">");
-    for effect in &report.effects {
-        page.push_str(&format!("<li><a href=\"#effect-{}\">{}</a>: ", anchor(&effect.id), escape(&effect.id)));
+    for (number, effect) in report.effects.iter().enumerate() {
+        page.push_str(&format!(
+            "<li><a href=\"#effect-{number}\">{}</a>",
+            escape(&effect.id)
+        ));
+        if report.signals.len() > 1 {
+            page.push_str(&format!(" in {}", code(&effect.signal)));
+        }
+        page.push_str(": ");
         let parameters: Vec<String> = effect.parameters.iter().map(in_words).collect();
         page.push_str(&escape(&parameters.join(", ")));
         if !effect.equivalent_to.is_empty() {
-            page.push_str(&format!(" – or {}", escape(&effect.equivalent_to.join(", "))));
+            page.push_str(&format!(
+                " – or {}",
+                escape(&effect.equivalent_to.join(", "))
+            ));
         }
         page.push_str("</li>");
     }
@@ -146,17 +220,20 @@ fn answer(page: &mut String, report: &Report) {
 
 fn in_words(parameter: &ParameterReport) -> String {
     let [value, low, high] = with_interval(parameter.value, parameter.ci95);
-    format!("{} = {} ({low} … {high})", parameter.name, quantity(&value, &parameter.unit))
-}
-
-/// An id is used in the page as an anchor: letters, digits and hyphens only.
-fn anchor(id: &str) -> String {
-    id.chars().map(|c| if c.is_ascii_alphanumeric() || c == '-' { c } else { '_' }).collect()
+    format!(
+        "{} = {} ({low} … {high})",
+        parameter.name,
+        quantity(&value, &parameter.unit)
+    )
 }
 
 /// A share as a bar with its number.
 fn bar(share: f64, class: &str) -> String {
-    let width = if share.is_finite() { 100.0 * share.clamp(0.0, 1.0) } else { 0.0 };
+    let width = if share.is_finite() {
+        100.0 * share.clamp(0.0, 1.0)
+    } else {
+        0.0
+    };
     format!(
         "<span class=\"share\"><span class=\"number\">{}</span><span class=\"track\" aria-hidden=\"true\"><span class=\"fill {class}\" style=\"width:{width:.1}%\"></span></span></span>",
         percent(share)
@@ -164,7 +241,9 @@ fn bar(share: f64, class: &str) -> String {
 }
 
 fn places(page: &mut String, report: &Report) {
-    page.push_str("<section aria-labelledby=\"where\">\n<h2 id=\"where\">Where the mismatch sits</h2>\n");
+    page.push_str(
+        "<section aria-labelledby=\"where\">\n<h2 id=\"where\">Where the mismatch sits</h2>\n",
+    );
     if report.locations.is_empty() {
         page.push_str(if report.verdict == Verdict::NoMismatch {
             "<p>Nowhere: no stretch of time, operating region or frequency holds more of the difference than its share of the samples.</p>\n</section>\n"
@@ -181,24 +260,33 @@ fn places(page: &mut String, report: &Report) {
     for location in &report.locations {
         let density = location.energy_share / location.sample_share;
         page.push_str(&format!(
-            "<tr><th scope=\"row\">{}</th><td data-label=\"Signal\"><code>{}</code></td><td data-label=\"Energy\">{}</td><td data-label=\"Samples\">{}</td>\
+            "<tr>{}<td data-label=\"Signal\">{}</td><td data-label=\"Energy\">{}</td><td data-label=\"Samples\">{}</td>\
              <td class=\"n\" data-label=\"Density\">{}</td><td class=\"p\" data-label=\"p\">{}</td><td data-label=\"Effect\">{}</td></tr>\n",
-            escape(&place(location)),
-            escape(&location.signal),
+            row_head(&place(location)),
+            code(&location.signal),
             bar(location.energy_share, "energy"),
             bar(location.sample_share, "samples"),
             if density.is_finite() { format!("×{}", significant(density, 2)) } else { String::new() },
-            p_value(location.p_value).trim_start_matches("p = ").trim_start_matches("p ").replace('<', "&lt; ").replace("  ", " "),
-            accounted_for(location),
+            escape(&p_value(location.p_value)),
+            accounted_for(report, location),
         ));
     }
     page.push_str("</tbody>\n</table>\n</section>\n");
 }
 
-fn accounted_for(location: &Location) -> String {
-    match &location.effect {
-        Some(effect) => format!("<a href=\"#effect-{}\">{}</a>", anchor(effect), escape(effect)),
-        None => "<span class=\"open\">nothing named</span>".to_owned(),
+fn accounted_for(report: &Report, location: &Location) -> String {
+    let Some(id) = &location.effect else {
+        return "<span class=\"gap\">nothing named</span>".to_owned();
+    };
+    // The same effect may be named in two signals.
+    let find = |same_signal: bool| {
+        report.effects.iter().position(|effect| {
+            effect.id == *id && (!same_signal || effect.signal == location.signal)
+        })
+    };
+    match find(true).or_else(|| find(false)) {
+        Some(number) => format!("<a href=\"#effect-{number}\">{}</a>", escape(id)),
+        None => escape(id),
     }
 }
 
@@ -208,25 +296,27 @@ fn effects(page: &mut String, report: &Report) {
         page.push_str(if report.verdict == Verdict::NoMismatch {
             "<p>None is needed.</p>\n"
         } else {
-            "<p>None is named: no effect of the library held on samples that were not fitted, and beat its placebos.</p>\n"
+            "<p>None is named: no effect of the library both held on samples that were not fitted and beat its placebos.</p>\n"
         });
     }
-    for effect in &report.effects {
-        one_effect(page, effect);
+    for (number, effect) in report.effects.iter().enumerate() {
+        one_effect(page, number, effect);
     }
     page.push_str("</section>\n");
 }
 
-fn one_effect(page: &mut String, effect: &EffectReport) {
-    let id = anchor(&effect.id);
+fn one_effect(page: &mut String, number: usize, effect: &EffectReport) {
     page.push_str(&format!(
-        "<article class=\"effect\" aria-labelledby=\"effect-{id}\">\n<h3 id=\"effect-{id}\">{}</h3>\n<p class=\"where\">shows in <code>{}</code></p>\n<p>{}</p>\n",
+        "<article class=\"effect\" aria-labelledby=\"effect-{number}\">\n<h3 id=\"effect-{number}\">{}</h3>\n<p class=\"where\">shows in {}</p>\n<p>{}</p>\n",
         escape(&effect.id),
-        escape(&effect.signal),
+        code(&effect.signal),
         escape(&effect.statement)
     ));
     if !effect.equation.is_empty() {
-        page.push_str(&format!("<p class=\"equation\"><code>{}</code></p>\n", escape(&effect.equation)));
+        page.push_str(&format!(
+            "<p class=\"equation\"><code>{}</code></p>\n",
+            escape(&effect.equation)
+        ));
     }
     if !effect.parameters.is_empty() {
         page.push_str(
@@ -236,8 +326,8 @@ fn one_effect(page: &mut String, effect: &EffectReport) {
         for parameter in &effect.parameters {
             let [value, low, high] = with_interval(parameter.value, parameter.ci95);
             page.push_str(&format!(
-                "<tr><th scope=\"row\"><code>{}</code></th><td class=\"n\" data-label=\"Value\">{}</td><td class=\"n\" data-label=\"95 % interval\">{} … {}</td><td class=\"wide\">{}</td></tr>\n",
-                escape(&parameter.name),
+                "<tr><th scope=\"row\">{}</th><td class=\"n\" data-label=\"Value\">{}</td><td class=\"n\" data-label=\"95 % interval\">{} … {}</td><td class=\"wide\">{}</td></tr>\n",
+                code(&parameter.name),
                 escape(&quantity(&value, &parameter.unit)),
                 low,
                 escape(&quantity(&high, &parameter.unit)),
@@ -256,12 +346,20 @@ fn one_effect(page: &mut String, effect: &EffectReport) {
     }
     page.push_str("<h4>What it could be confused with</h4>\n");
     if effect.equivalent_to.is_empty() {
-        page.push_str("<p>Nothing in the library: no other effect fits this recording as well.</p>\n");
+        page.push_str(
+            "<p>Nothing in the library: no other effect fits this recording as well.</p>\n",
+        );
     } else {
-        let names: Vec<String> = effect.equivalent_to.iter().map(|id| format!("<code>{}</code>", escape(id))).collect();
-        page.push_str(&format!("<p class=\"confused\">On this recording it cannot be told apart from {}.", names.join(", ")));
+        let names: Vec<String> = effect.equivalent_to.iter().map(|id| code(id)).collect();
+        page.push_str(&format!(
+            "<p class=\"confused\">On this recording it cannot be told apart from {}.",
+            names.join(", ")
+        ));
         if !effect.separated_by.is_empty() {
-            page.push_str(&format!(" <strong>What would separate them:</strong> {}", escape(&effect.separated_by)));
+            page.push_str(&format!(
+                " <strong>What would separate them:</strong> {}",
+                escape(&effect.separated_by)
+            ));
         }
         page.push_str("</p>\n");
     }
@@ -272,8 +370,15 @@ fn one_effect(page: &mut String, effect: &EffectReport) {
 fn evidence(page: &mut String, effect: &EffectReport) {
     let ratio = effect.held_out_gain / effect.placebo_p99;
     page.push_str("<h4>Evidence</h4>\n<div class=\"bars\" aria-hidden=\"true\">");
-    for (what, class, share) in [("this effect", "gain", effect.held_out_gain), ("placebos", "samples", effect.placebo_p99)] {
-        let width = if share.is_finite() { 100.0 * share.clamp(0.0, 1.0) } else { 0.0 };
+    for (what, class, share) in [
+        ("this effect", "gain", effect.held_out_gain),
+        ("placebos", "samples", effect.placebo_p99),
+    ] {
+        let width = if share.is_finite() {
+            100.0 * share.clamp(0.0, 1.0)
+        } else {
+            0.0
+        };
         page.push_str(&format!(
             "<span>{what}</span><span class=\"track tall\"><span class=\"fill {class}\" style=\"width:{width:.2}%\"></span></span><span class=\"n\">{}</span>",
             percent(share)
@@ -293,7 +398,7 @@ fn interval(parameter: &ParameterReport) -> String {
     let [low, high] = parameter.ci95;
     let value = parameter.value;
     if ![low, high, value].iter().all(|v| v.is_finite()) || high < low {
-        return "<span class=\"open\">not bounded</span>".to_owned();
+        return "<span class=\"gap\">not bounded</span>".to_owned();
     }
     let off = parameter.off.filter(|v| v.is_finite());
     let (mut from, mut to) = (low.min(value), high.max(value));
@@ -304,12 +409,20 @@ fn interval(parameter: &ParameterReport) -> String {
         let width = to - from;
         (from, to) = (from - width, to + width);
     }
-    let span = if to > from { to - from } else { value.abs().max(1.0) };
+    let span = if to > from {
+        to - from
+    } else {
+        value.abs().max(1.0)
+    };
     // A margin, so that neither end sits on the edge.
     let at = |v: f64| 4.0 + 92.0 * ((v - from) / span).clamp(0.0, 1.0);
-    let mut drawing = String::from("<span class=\"interval\" aria-hidden=\"true\"><span class=\"axis\"></span>");
+    let mut drawing =
+        String::from("<span class=\"interval\" aria-hidden=\"true\"><span class=\"axis\"></span>");
     if let Some(off) = off {
-        drawing.push_str(&format!("<span class=\"off\" style=\"left:{:.2}%\"><span>off</span></span>", at(off)));
+        drawing.push_str(&format!(
+            "<span class=\"off\" style=\"left:{:.2}%\"><span>off</span></span>",
+            at(off)
+        ));
     }
     drawing.push_str(&format!(
         "<span class=\"range\" style=\"left:{:.2}%;width:{:.2}%\"></span><span class=\"dot\" style=\"left:{:.2}%\"></span></span>",
@@ -331,11 +444,16 @@ fn before_and_after(page: &mut String, report: &Report, drawn: &[(usize, Picture
              <th scope=\"col\" class=\"n\">before</th><th scope=\"col\" class=\"n\">after</th><th scope=\"col\" class=\"n\">change</th></tr></thead>\n<tbody>\n",
         );
         for signal in &report.signals {
-            let cell = |value: f64| format!("<td class=\"n\">{}</td>", escape(&quantity(&significant(value, 3), &signal.unit)));
+            let cell = |value: f64| {
+                format!(
+                    "<td class=\"n\">{}</td>",
+                    escape(&quantity(&significant(value, 3), &signal.unit))
+                )
+            };
             let strong = |text: String| format!("<td class=\"n\"><strong>{text}</strong></td>");
             page.push_str(&format!(
-                "<tr><th scope=\"row\"><code>{}</code></th>{}{}{}{}{}<td class=\"n\">{}</td>{}<td class=\"n\">{}</td></tr>\n",
-                escape(&signal.name),
+                "<tr><th scope=\"row\">{}</th>{}{}{}{}{}<td class=\"n\">{}</td>{}<td class=\"n\">{}</td></tr>\n",
+                code(&signal.name),
                 cell(signal.held_out_blocks_before),
                 cell(signal.held_out_blocks_after),
                 strong(change(signal.held_out_blocks_before, signal.held_out_blocks_after)),
@@ -352,14 +470,21 @@ fn before_and_after(page: &mut String, report: &Report, drawn: &[(usize, Picture
         page.push_str(
             "<p class=\"hint screen\">Drag over a plot to zoom in; double-click to see all. Click a plot and its wheel zooms, too (or hold Ctrl). \
              With the keyboard: <kbd>+</kbd> <kbd>−</kbd> zoom, <kbd>←</kbd> <kbd>→</kbd> move, <kbd>0</kbd> shows all. By touch: two fingers. \
-             A click on a name of the legend hides its line. Shaded: the places of the table above.</p>\n\
+             A click on a name of the legend hides its line. Shaded: places of the table above.</p>\n\
              <noscript><p class=\"hint\">The plots are drawn by a script, which this browser does not run. Every number is in the tables and texts.</p></noscript>\n",
         );
     }
     for (number, (index, pictures)) in drawn.iter().enumerate() {
-        let Some(plots) = report.plots.get(*index) else { continue };
-        page.push_str(&format!("<h3 class=\"signal\"><code>{}</code></h3>\n", escape(&plots.name)));
-        if let Some(signal) = report.signals.iter().find(|signal| signal.name == plots.name) {
+        let Some(plots) = report.plots.get(*index) else {
+            continue;
+        };
+        page.push_str(&format!(
+            "<h3 class=\"signal\">{}</h3>\n",
+            code(&plots.name)
+        ));
+        let mut signals = report.signals.iter();
+        let signal = signals.find(|signal| signal.name == plots.name);
+        if let Some(signal) = signal.filter(|_| !pictures.same) {
             error_bars(page, signal);
         }
         signal_figures(page, number, &plots.name, &plots.unit, pictures);
@@ -369,13 +494,24 @@ fn before_and_after(page: &mut String, report: &Report, drawn: &[(usize, Picture
 
 /// Held-out error before and after as bars, with the noise floor.
 fn error_bars(page: &mut String, signal: &SignalReport) {
-    let largest = signal.held_out_blocks_before.max(signal.held_out_blocks_after);
+    let largest = signal
+        .held_out_blocks_before
+        .max(signal.held_out_blocks_after);
     if !(largest.is_finite() && largest > 0.0) {
         return;
     }
-    let width = |value: f64| if value.is_finite() { 100.0 * (value / largest).clamp(0.0, 1.0) } else { 0.0 };
+    let width = |value: f64| {
+        if value.is_finite() {
+            100.0 * (value / largest).clamp(0.0, 1.0)
+        } else {
+            0.0
+        }
+    };
     page.push_str("<div class=\"bars\" aria-hidden=\"true\">");
-    for (what, value) in [("before", signal.held_out_blocks_before), ("after", signal.held_out_blocks_after)] {
+    for (what, value) in [
+        ("before", signal.held_out_blocks_before),
+        ("after", signal.held_out_blocks_after),
+    ] {
         page.push_str(&format!(
             "<span>{what}</span><span class=\"track tall\"><span class=\"fill {what}\" style=\"width:{:.2}%\"></span><span class=\"floor\" style=\"left:{:.2}%\"></span></span><span class=\"n\">{}</span>",
             width(value),
@@ -400,7 +536,14 @@ struct Figure<'a> {
 }
 
 fn figure(page: &mut String, figure: &Figure<'_>, words: &Words) {
-    let Figure { signal, kind, index, title, axes, caption } = figure;
+    let Figure {
+        signal,
+        kind,
+        index,
+        title,
+        axes,
+        caption,
+    } = figure;
     let id = format!("caption-{signal}-{kind}-{index}");
     page.push_str(&format!(
         "<figure class=\"plot {kind}\" data-signal=\"{signal}\" data-plot=\"{kind}\" data-index=\"{index}\">\n<div class=\"head\"><h4>{}</h4><span class=\"axes\">{}</span></div>\n\
@@ -412,42 +555,63 @@ fn figure(page: &mut String, figure: &Figure<'_>, words: &Words) {
         escape(caption),
     ));
     if !words.reduced.is_empty() {
-        page.push_str(&format!(" <span class=\"reduced\">{}</span>", escape(&words.reduced)));
+        page.push_str(&format!(
+            " <span class=\"reduced\">{}</span>",
+            escape(&words.reduced)
+        ));
     }
-    page.push_str(&format!("<details><summary>In numbers</summary><p>{}</p></details></figcaption>\n</figure>\n", escape(&words.text)));
+    page.push_str(&format!(
+        "<details><summary>In numbers</summary><p>{}</p></details></figcaption>\n</figure>\n",
+        escape(&words.text)
+    ));
 }
 
 fn signal_figures(page: &mut String, number: usize, name: &str, unit: &str, pictures: &Pictures) {
     let per_second = quantity(&format!("{name},"), unit);
-    let after = if pictures.held_out {
+    let after = if pictures.same {
+        "No effect was added to the simulation."
+    } else if pictures.held_out {
         "After: each block predicted by a model that was fitted on the other blocks only (held out)."
     } else {
         "After: the fitted model."
     };
-    figure(
-        page,
-        &Figure {
-            signal: number,
-            kind: "time",
-            index: 0,
-            title: "Recorded and simulated".to_owned(),
-            axes: format!("{per_second} over time, s"),
-            caption: "Recorded, as simulated before, and as simulated with the effects above.".to_owned(),
-        },
-        &pictures.time,
-    );
-    figure(
-        page,
-        &Figure {
-            signal: number,
-            kind: "residual",
-            index: 0,
-            title: "What is left: recorded − simulated".to_owned(),
-            axes: format!("{unit} over time, s"),
-            caption: format!("{after} Hide “before” in the legend to see in detail what is left."),
-        },
-        &pictures.residual,
-    );
+    if let Some(words) = &pictures.time {
+        figure(
+            page,
+            &Figure {
+                signal: number,
+                kind: "time",
+                index: 0,
+                title: "Recorded and simulated".to_owned(),
+                axes: format!("{per_second} over time, s"),
+                caption: if pictures.same {
+                    "Recorded and simulated."
+                } else {
+                    "Recorded, as simulated before, and as simulated with the effects above."
+                }
+                .to_owned(),
+            },
+            words,
+        );
+    }
+    if let Some(words) = &pictures.residual {
+        figure(
+            page,
+            &Figure {
+                signal: number,
+                kind: "residual",
+                index: 0,
+                title: "What is left: recorded − simulated".to_owned(),
+                axes: format!("{unit} over time, s"),
+                caption: if pictures.same {
+                    after.to_owned()
+                } else {
+                    format!("{after} Hide “before” in the legend to see in detail what is left.")
+                },
+            },
+            words,
+        );
+    }
     page.push_str("<div class=\"grid\">\n");
     for (index, (variable, words)) in pictures.against.iter().enumerate() {
         figure(
@@ -457,7 +621,7 @@ fn signal_figures(page: &mut String, number: usize, name: &str, unit: &str, pict
                 kind: "against",
                 index,
                 title: format!("Residual against {variable}"),
-                axes: format!("recorded − simulated, {unit}"),
+                axes: format!("residual, {unit}"),
                 caption: "Dots: samples. Line and band: median and 5 … 95 % in bins.".to_owned(),
             },
             words,
@@ -492,13 +656,13 @@ fn holdouts(page: &mut String, report: &Report) {
         let unit = unit_of(report, &holdout.signal);
         let worse = holdout.rmse_after > holdout.rmse_before;
         page.push_str(&format!(
-            "<tr><th scope=\"row\">{}</th><td data-label=\"Signal\"><code>{}</code></td><td class=\"n\" data-label=\"RMSE before\">{}</td><td class=\"n\" data-label=\"RMSE after\">{}</td>\
+            "<tr>{}<td data-label=\"Signal\">{}</td><td class=\"n\" data-label=\"RMSE before\">{}</td><td class=\"n\" data-label=\"RMSE after\">{}</td>\
              <td class=\"n\" data-label=\"Change\"><strong{}>{}</strong></td></tr>\n",
-            escape(&holdout.file),
-            escape(&holdout.signal),
+            row_head(&holdout.file),
+            code(&holdout.signal),
             escape(&quantity(&significant(holdout.rmse_before, 3), unit)),
             escape(&quantity(&significant(holdout.rmse_after, 3), unit)),
-            if worse { " class=\"open\"" } else { "" },
+            if worse { " class=\"gap\"" } else { "" },
             change(holdout.rmse_before, holdout.rmse_after) + if worse { " (worse)" } else { "" },
         ));
     }
@@ -517,10 +681,14 @@ fn unexplained(page: &mut String, report: &Report) {
     );
     for left in &report.unexplained {
         let unit = unit_of(report, &left.signal);
-        let floor = report.signals.iter().find(|signal| signal.name == left.signal).map_or(f64::NAN, |signal| signal.noise_floor);
+        let floor = report
+            .signals
+            .iter()
+            .find(|signal| signal.name == left.signal)
+            .map_or(f64::NAN, |signal| signal.noise_floor);
         page.push_str(&format!(
-            "<tr><th scope=\"row\"><code>{}</code></th><td class=\"n\" data-label=\"Left (RMS)\">{}</td><td class=\"n\" data-label=\"Noise floor\">{}</td><td data-label=\"Explainable\">{}</td><td data-label=\"Largest at\">{}</td></tr>\n",
-            escape(&left.signal),
+            "<tr><th scope=\"row\">{}</th><td class=\"n\" data-label=\"Left (RMS)\">{}</td><td class=\"n\" data-label=\"Noise floor\">{}</td><td data-label=\"Explainable\">{}</td><td data-label=\"Largest at\">{}</td></tr>\n",
+            code(&left.signal),
             escape(&quantity(&significant(left.rmse, 3), unit)),
             escape(&quantity(&significant(floor, 3), unit)),
             bar(left.explainable_share, "energy"),
@@ -547,7 +715,9 @@ fn list(page: &mut String, id: &str, title: &str, lines: &[String], ordered: boo
         return;
     }
     let tag = if ordered { "ol" } else { "ul" };
-    page.push_str(&format!("<section aria-labelledby=\"{id}\">\n<h2 id=\"{id}\">{title}</h2>\n<{tag}>\n"));
+    page.push_str(&format!(
+        "<section aria-labelledby=\"{id}\">\n<h2 id=\"{id}\">{title}</h2>\n<{tag}>\n"
+    ));
     for line in lines {
         page.push_str(&format!("<li>{}</li>\n", escape(line)));
     }

@@ -9,8 +9,8 @@ use serde::Serialize;
 
 use super::data::{Location, LocationKind, Report, SignalPlots};
 
-/// Values that one page holds over all signals; at 9 characters or less each they stay below 4 MB.
-pub const VALUES_PER_PAGE: usize = 400_000;
+/// Values that one page holds over all signals; at some 5 to 9 characters each they stay below 4.5 MB.
+pub const VALUES_PER_PAGE: usize = 500_000;
 /// Samples drawn in one picture of the residual against a variable, at most, beside the extremes.
 const POINTS: usize = 2_400;
 /// Columns of which the extremes are drawn in any case.
@@ -46,16 +46,18 @@ pub struct Words {
 pub struct Pictures {
     /// JSON for the script.
     pub data: Data,
-    /// The signal over time.
-    pub time: Words,
-    /// The residual over time.
-    pub residual: Words,
+    /// The signal over time, if there is anything to draw.
+    pub time: Option<Words>,
+    /// The residual over time, if there is one.
+    pub residual: Option<Words>,
     /// The residual against each variable, with the variable's name.
     pub against: Vec<(String, Words)>,
     /// The spectrum, if there is one.
     pub spectrum: Option<Words>,
     /// True if the residual "after" is of held-out blocks.
     pub held_out: bool,
+    /// True if there is only one simulation: no effect was added.
+    pub same: bool,
 }
 
 /// What the script is given for one signal.
@@ -78,7 +80,8 @@ struct Against {
     variable: String,
     x: Column,
     before: Column,
-    after: Column,
+    /// None if it is the same as before.
+    after: Option<Column>,
     bins: Bins,
     /// Open-ended ranges of the variable that the report names.
     places: Vec<Place>,
@@ -97,7 +100,8 @@ struct Bins {
 struct Spectrum {
     f: Vec<f64>,
     before: Vec<Option<f64>>,
-    after: Vec<Option<f64>>,
+    /// None if it is the same as before.
+    after: Option<Vec<Option<f64>>>,
 }
 
 #[derive(Clone, Serialize)]
@@ -109,14 +113,21 @@ struct Place {
 
 /// The pictures of every signal that has any samples.
 pub fn pictures(report: &Report) -> Vec<(usize, Pictures)> {
-    let drawable: Vec<(usize, &SignalPlots)> =
-        report.plots.iter().enumerate().filter(|(_, plots)| !plots.t_s.is_empty()).collect();
+    let drawable: Vec<(usize, &SignalPlots)> = report
+        .plots
+        .iter()
+        .enumerate()
+        .filter(|(_, plots)| !plots.t_s.is_empty())
+        .collect();
     let each = VALUES_PER_PAGE / drawable.len().max(1);
     drawable
         .into_iter()
         .map(|(index, plots)| {
-            let places: Vec<&Location> =
-                report.locations.iter().filter(|location| location.signal == plots.name).collect();
+            let places: Vec<&Location> = report
+                .locations
+                .iter()
+                .filter(|location| location.signal == plots.name)
+                .collect();
             (index, pictures_of(plots, &places, each))
         })
         .collect()
@@ -124,23 +135,38 @@ pub fn pictures(report: &Report) -> Vec<(usize, Pictures)> {
 
 fn pictures_of(plots: &SignalPlots, locations: &[&Location], budget: usize) -> Pictures {
     let rows = plots.t_s.len();
-    let held_out = plots.held_out_residual.len() == rows && plots.held_out_residual.iter().any(|v| v.is_finite());
+    let held_out = plots.held_out_residual.len() == rows
+        && plots.held_out_residual.iter().any(|v| v.is_finite());
     let before: Vec<f64> = difference(&plots.recorded, &plots.before, rows);
     let fitted: Vec<f64> = difference(&plots.recorded, &plots.after, rows);
-    let after: &[f64] = if held_out { &plots.held_out_residual } else { &fitted };
+    let after: &[f64] = if held_out {
+        &plots.held_out_residual
+    } else {
+        &fitted
+    };
 
+    // Without an effect there is no second simulation to draw over the first.
+    let same = !held_out
+        && before
+            .iter()
+            .zip(&fitted)
+            .all(|(before, fitted)| before == fitted || !before.is_finite());
     let mut values: Vec<(&'static str, &[f64])> = vec![
         ("recorded", &plots.recorded),
         ("before", &plots.before),
         ("after", &plots.after),
         ("reference", &plots.reference),
     ];
-    values.retain(|(_, series)| series.len() == rows && series.iter().any(|v| v.is_finite()));
+    values.retain(|(name, series)| {
+        !(same && *name == "after") && series.len() == rows && series.iter().any(|v| v.is_finite())
+    });
     let mut residuals: Vec<(&'static str, &[f64])> = vec![("before", &before), ("after", after)];
     if held_out {
         residuals.push(("fitted", &fitted));
     }
-    residuals.retain(|(_, series)| series.iter().any(|v| v.is_finite()));
+    residuals.retain(|(name, series)| {
+        !(same && *name == "after") && series.iter().any(|v| v.is_finite())
+    });
 
     let timeline = Timeline::of(&plots.t_s);
     let columns = 1 + values.len() + residuals.len();
@@ -155,14 +181,17 @@ fn pictures_of(plots: &SignalPlots, locations: &[&Location], budget: usize) -> P
         .variables
         .iter()
         .filter(|(_, series)| series.len() == rows)
-        .filter_map(|(name, series)| against(name, series, &before, after, points, locations))
+        .filter_map(|(name, series)| against(name, series, &before, after, same, points, locations))
         .collect();
-    let (against, against_words): (Vec<_>, Vec<_>) =
-        against.into_iter().map(|(data, words)| ((data.variable.clone(), data), words)).map(|((n, d), w)| (d, (n, w))).unzip();
-    let spectrum = spectrum(&plots.spectrum);
+    let (against, against_words): (Vec<_>, Vec<_>) = against
+        .into_iter()
+        .map(|(data, words)| ((data.variable.clone(), data), words))
+        .map(|((n, d), w)| (d, (n, w)))
+        .unzip();
+    let spectrum = spectrum(&plots.spectrum, same);
 
     Pictures {
-        time: Words {
+        time: (!values.is_empty()).then(|| Words {
             text: values
                 .iter()
                 .map(|(name, series)| range_in_words(name, series, &plots.unit))
@@ -170,35 +199,56 @@ fn pictures_of(plots: &SignalPlots, locations: &[&Location], budget: usize) -> P
                 .join("; ")
                 + ".",
             reduced: reduced.clone(),
-        },
-        residual: Words {
+        }),
+        residual: (!residuals.is_empty()).then(|| Words {
             text: residuals
                 .iter()
                 .map(|(name, series)| {
                     format!(
                         "{}, root mean square {}",
                         range_in_words(name, series, &plots.unit),
-                        super::format::quantity(&super::format::significant(rms(series), 3), &plots.unit)
+                        super::format::quantity(
+                            &super::format::significant(rms(series), 3),
+                            &plots.unit
+                        )
                     )
                 })
                 .collect::<Vec<_>>()
                 .join("; ")
                 + ".",
             reduced,
-        },
+        }),
         against: against_words,
-        spectrum: spectrum.as_ref().map(|(_, words)| Words { text: words.text.clone(), reduced: words.reduced.clone() }),
+        spectrum: spectrum.as_ref().map(|(_, words)| Words {
+            text: words.text.clone(),
+            reduced: words.reduced.clone(),
+        }),
         held_out,
+        same,
         data: Data {
             unit: plots.unit.clone(),
-            t: Column::of(&layout.time(&timeline.t_s), Resolution::Time(timeline.median_step_s)),
-            values: values.iter().map(|(name, series)| (*name, column(series))).collect(),
-            residuals: residuals.iter().map(|(name, series)| (*name, column(series))).collect(),
+            t: Column::of(
+                &layout.time(&timeline.t_s),
+                Resolution::Time(timeline.median_step_s),
+            ),
+            values: values
+                .iter()
+                .map(|(name, series)| (*name, column(series)))
+                .collect(),
+            residuals: residuals
+                .iter()
+                .map(|(name, series)| (*name, column(series)))
+                .collect(),
             against,
             spectrum: spectrum.map(|(data, _)| data),
             places: locations
                 .iter()
-                .filter(|location| location.kind != LocationKind::Region)
+                // Laid end to end, a recorded time is no longer one place.
+                .filter(|location| match location.kind {
+                    LocationKind::Time => timeline.anew == 0,
+                    LocationKind::Region => false,
+                    LocationKind::Frequency => true,
+                })
                 .map(|location| Place::of(location))
                 .collect(),
         },
@@ -209,7 +259,10 @@ fn difference(left: &[f64], right: &[f64], rows: usize) -> Vec<f64> {
     if left.len() != rows || right.len() != rows {
         return vec![f64::NAN; rows];
     }
-    left.iter().zip(right).map(|(left, right)| left - right).collect()
+    left.iter()
+        .zip(right)
+        .map(|(left, right)| left - right)
+        .collect()
 }
 
 fn rms(series: &[f64]) -> f64 {
@@ -221,10 +274,13 @@ fn rms(series: &[f64]) -> f64 {
 }
 
 fn range(series: &[f64]) -> Option<(f64, f64)> {
-    series.iter().filter(|v| v.is_finite()).fold(None, |range, v| match range {
-        None => Some((*v, *v)),
-        Some((low, high)) => Some((f64::min(low, *v), f64::max(high, *v))),
-    })
+    series
+        .iter()
+        .filter(|v| v.is_finite())
+        .fold(None, |range, v| match range {
+            None => Some((*v, *v)),
+            Some((low, high)) => Some((f64::min(low, *v), f64::max(high, *v))),
+        })
 }
 
 fn range_in_words(name: &str, series: &[f64], unit: &str) -> String {
@@ -254,15 +310,22 @@ impl Timeline {
             .filter(|step| step.is_finite() && *step > 0.0)
             .collect();
         let middle = steps.len() / 2;
-        let median_step_s =
-            if steps.is_empty() { 1.0 } else { *steps.select_nth_unstable_by(middle, f64::total_cmp).1 };
+        let median_step_s = if steps.is_empty() {
+            1.0
+        } else {
+            *steps.select_nth_unstable_by(middle, f64::total_cmp).1
+        };
         let mut t_s = Vec::with_capacity(recorded_t_s.len());
         let (mut shift, mut anew) = (0.0, 0);
         let mut starts = vec![0];
         let mut last: Option<f64> = None;
         for (row, &recorded) in recorded_t_s.iter().enumerate() {
             // A row without a time has no place of its own; it is drawn with the one before.
-            let mut t = if recorded.is_finite() { recorded + shift } else { last.unwrap_or(0.0) };
+            let mut t = if recorded.is_finite() {
+                recorded + shift
+            } else {
+                last.unwrap_or(0.0)
+            };
             if let Some(last) = last {
                 if t < last {
                     // Operations whose time starts anew are laid end to end.
@@ -280,7 +343,12 @@ impl Timeline {
         if starts.len() > MOST_GAPS {
             starts.truncate(1);
         }
-        Self { t_s, starts, anew, median_step_s }
+        Self {
+            t_s,
+            starts,
+            anew,
+            median_step_s,
+        }
     }
 }
 
@@ -296,7 +364,13 @@ struct Layout {
 impl Layout {
     fn of(timeline: &Timeline, rows: usize, allowed: usize) -> Self {
         let reduced = rows + timeline.starts.len() > allowed;
-        let size = if reduced { (2 * rows).div_ceil(allowed.saturating_sub(3 * timeline.starts.len()).max(8)).max(2) } else { 1 };
+        let size = if reduced {
+            (2 * rows)
+                .div_ceil(allowed.saturating_sub(3 * timeline.starts.len()).max(8))
+                .max(2)
+        } else {
+            1
+        };
         let mut buckets = Vec::new();
         let mut breaks = Vec::new();
         for (stretch, &start) in timeline.starts.iter().enumerate() {
@@ -304,9 +378,17 @@ impl Layout {
             if stretch > 0 {
                 breaks.push(buckets.len());
             }
-            buckets.extend((start..end).step_by(size).map(|first| first..(first + size).min(end)));
+            buckets.extend(
+                (start..end)
+                    .step_by(size)
+                    .map(|first| first..(first + size).min(end)),
+            );
         }
-        Self { buckets, breaks, reduced }
+        Self {
+            buckets,
+            breaks,
+            reduced,
+        }
     }
 
     fn words(&self, rows: usize, anew: usize) -> String {
@@ -319,7 +401,13 @@ impl Layout {
             );
         }
         if anew > 0 {
-            let end_to_end = format!("The recorded time starts anew {anew} times; the parts are laid end to end.");
+            let times = match anew {
+                1 => "once".to_owned(),
+                _ => format!("{anew} times"),
+            };
+            let end_to_end = format!(
+                "The recorded time starts anew {times}; the parts are laid end to end, and places in time are not shaded."
+            );
             if !words.is_empty() {
                 words.push(' ');
             }
@@ -345,7 +433,9 @@ impl Layout {
             let low = finite().min_by(|a, b| a.1.total_cmp(b.1));
             let high = finite().max_by(|a, b| a.1.total_cmp(b.1));
             match (low, high) {
-                (Some((at_low, low)), Some((at_high, high))) if at_low <= at_high => drawn.extend([*low, *high]),
+                (Some((at_low, low)), Some((at_high, high))) if at_low <= at_high => {
+                    drawn.extend([*low, *high])
+                }
                 (Some((_, low)), Some((_, high))) => drawn.extend([*high, *low]),
                 _ => drawn.extend([f64::NAN; 2]),
             }
@@ -360,7 +450,11 @@ impl Layout {
         for (index, bucket) in self.buckets.iter().enumerate() {
             let first = t_s[bucket.start];
             if breaks.next_if_eq(&&index).is_some() {
-                drawn.push(drawn.last().map_or(first, |last| last + (first - last) / 2.0));
+                drawn.push(
+                    drawn
+                        .last()
+                        .map_or(first, |last| last + (first - last) / 2.0),
+                );
             }
             drawn.push(first);
             if self.reduced {
@@ -423,29 +517,42 @@ fn against(
     variable: &[f64],
     before: &[f64],
     after: &[f64],
+    same: bool,
     points: usize,
     locations: &[&Location],
 ) -> Option<(Against, Words)> {
     let usable = |row: usize| variable[row].is_finite() && before[row].is_finite();
     let total = (0..variable.len()).filter(|row| usable(*row)).count();
-    let (low, high) =
-        range(&variable.iter().zip(before).map(|(x, y)| if y.is_finite() { *x } else { f64::NAN }).collect::<Vec<_>>())?;
+    let (low, high) = range(
+        &variable
+            .iter()
+            .zip(before)
+            .map(|(x, y)| if y.is_finite() { *x } else { f64::NAN })
+            .collect::<Vec<_>>(),
+    )?;
     let width = if high > low { high - low } else { 1.0 };
 
     // Every so many-th row, and of each column the extremes.
     let stride = total.div_ceil(points).max(1);
     let mut drawn = Vec::with_capacity(points + 4 * EXTREME_COLUMNS);
     let mut extremes: Vec<Option<[usize; 4]>> = vec![None; EXTREME_COLUMNS];
-    let mut counted = 0;
-    for row in (0..variable.len()).filter(|row| usable(*row)) {
+    let usable_rows = (0..variable.len()).filter(|row| usable(*row));
+    for (counted, row) in usable_rows.enumerate() {
         if counted % stride == 0 {
             drawn.push(row);
         }
-        counted += 1;
-        let column = (((variable[row] - low) / width * EXTREME_COLUMNS as f64) as usize).min(EXTREME_COLUMNS - 1);
+        let column = (((variable[row] - low) / width * EXTREME_COLUMNS as f64) as usize)
+            .min(EXTREME_COLUMNS - 1);
         let extreme = extremes[column].get_or_insert([row; 4]);
-        for (slot, series, sign) in [(0, before, 1.0), (1, before, -1.0), (2, after, 1.0), (3, after, -1.0)] {
-            if !series[extreme[slot]].is_finite() || sign * series[row] > sign * series[extreme[slot]] {
+        for (slot, series, sign) in [
+            (0, before, 1.0),
+            (1, before, -1.0),
+            (2, after, 1.0),
+            (3, after, -1.0),
+        ] {
+            if !series[extreme[slot]].is_finite()
+                || sign * series[row] > sign * series[extreme[slot]]
+            {
                 extreme[slot] = row;
             }
         }
@@ -466,8 +573,15 @@ fn against(
             .max_by(|a, b| a.0[1].abs().total_cmp(&b.0[1].abs()))
             .map(|(q, x)| (q[1], x.unwrap_or(f64::NAN)))
     };
-    let mut text = format!("{name} runs from {} to {}.", super::format::significant(low, 3), super::format::significant(high, 3));
+    let mut text = format!(
+        "{name} runs from {} to {}.",
+        super::format::significant(low, 3),
+        super::format::significant(high, 3)
+    );
     for (which, quantiles) in [("before", &bins.before), ("after", &bins.after)] {
+        if same && which == "after" {
+            continue;
+        }
         if let Some((median, x)) = largest(quantiles) {
             text.push_str(&format!(
                 " Largest median {which}: {} at {}.",
@@ -489,10 +603,12 @@ fn against(
         variable: name.to_owned(),
         x: Column::of(&pick(variable), Resolution::Value),
         before: Column::of(&pick(before), Resolution::Value),
-        after: Column::of(&pick(after), Resolution::Value),
+        after: (!same).then(|| Column::of(&pick(after), Resolution::Value)),
         places: locations
             .iter()
-            .filter(|location| location.kind == LocationKind::Region && same_variable(name, &location.variable))
+            .filter(|location| {
+                location.kind == LocationKind::Region && same_variable(name, &location.variable)
+            })
             .map(|location| Place::of(location))
             .collect(),
         bins,
@@ -511,7 +627,11 @@ fn same_variable(with_unit: &str, variable: &str) -> bool {
 /// Median and 5 … 95 % of the residual in bins of the variable, of all rows.
 fn bins(variable: &[f64], before: &[f64], after: &[f64], low: f64, width: f64) -> Bins {
     let mut values: Vec<f64> = Vec::with_capacity(DISCRETE + 1);
-    for (x, _) in variable.iter().zip(before).filter(|(x, y)| x.is_finite() && y.is_finite()) {
+    for (x, _) in variable
+        .iter()
+        .zip(before)
+        .filter(|(x, y)| x.is_finite() && y.is_finite())
+    {
         if values.len() > DISCRETE {
             break;
         }
@@ -528,7 +648,9 @@ fn bins(variable: &[f64], before: &[f64], after: &[f64], low: f64, width: f64) -
             continue;
         }
         let bin = if discrete {
-            values.binary_search_by(|value| value.total_cmp(&x)).unwrap_or(0)
+            values
+                .binary_search_by(|value| value.total_cmp(&x))
+                .unwrap_or(0)
         } else {
             (((x - low) / width * BINS as f64) as usize).min(BINS - 1)
         };
@@ -555,7 +677,10 @@ fn bins(variable: &[f64], before: &[f64], after: &[f64], low: f64, width: f64) -
         }
         filled = joined;
     }
-    let mut bins = Bins { discrete, ..Bins::default() };
+    let mut bins = Bins {
+        discrete,
+        ..Bins::default()
+    };
     for [xs, mut befores, mut afters] in filled {
         if xs.is_empty() {
             continue;
@@ -582,36 +707,74 @@ fn quantiles(values: &mut [f64]) -> [f64; 3] {
     })
 }
 
-fn spectrum(spectrum: &[(f64, f64, f64)]) -> Option<(Spectrum, Words)> {
-    let lines: Vec<_> = spectrum.iter().filter(|(f, ..)| f.is_finite() && *f > 0.0).collect();
+fn spectrum(spectrum: &[(f64, f64, f64)], same: bool) -> Option<(Spectrum, Words)> {
+    let lines: Vec<_> = spectrum
+        .iter()
+        .filter(|(f, ..)| f.is_finite() && *f > 0.0)
+        .collect();
     if lines.is_empty() {
         return None;
     }
     let size = lines.len().div_ceil(FREQUENCIES);
-    let mut data = Spectrum { f: Vec::new(), before: Vec::new(), after: Vec::new() };
-    let short = |value: f64| (value.is_finite() && value > 0.0).then(|| format!("{value:.4e}").parse().unwrap_or(value));
+    let (mut f, mut before, mut after) = (Vec::new(), Vec::new(), Vec::new());
+    let short = |value: f64| {
+        (value.is_finite() && value > 0.0).then(|| format!("{value:.4e}").parse().unwrap_or(value))
+    };
     for bucket in lines.chunks(size) {
-        data.f.push(format!("{:.6e}", bucket[0].0).parse().unwrap_or(bucket[0].0));
-        data.before.push(short(bucket.iter().map(|line| line.1).fold(f64::NAN, f64::max)));
-        data.after.push(short(bucket.iter().map(|line| line.2).fold(f64::NAN, f64::max)));
+        f.push(
+            format!("{:.6e}", bucket[0].0)
+                .parse()
+                .unwrap_or(bucket[0].0),
+        );
+        before.push(short(
+            bucket.iter().map(|line| line.1).fold(f64::NAN, f64::max),
+        ));
+        after.push(short(
+            bucket.iter().map(|line| line.2).fold(f64::NAN, f64::max),
+        ));
     }
     let peak = |pick: fn(&(f64, f64, f64)) -> f64| {
         lines
             .iter()
             .filter(|line| pick(line).is_finite())
             .max_by(|a, b| pick(a).total_cmp(&pick(b)))
-            .map(|line| format!("{} at {} Hz", super::format::significant(pick(line), 3), super::format::significant(line.0, 3)))
+            .map(|line| {
+                format!(
+                    "{} at {} Hz",
+                    super::format::significant(pick(line), 3),
+                    super::format::significant(line.0, 3)
+                )
+            })
             .unwrap_or_else(|| super::format::NONE.to_owned())
     };
     let words = Words {
-        text: format!("Largest line before: {}; after: {}.", peak(|line| line.1), peak(|line| line.2)),
+        text: if same {
+            format!("Largest line: {}.", peak(|line| line.1))
+        } else {
+            format!(
+                "Largest line before: {}; after: {}.",
+                peak(|line| line.1),
+                peak(|line| line.2)
+            )
+        },
         reduced: if size > 1 {
-            format!("{} frequencies are drawn as {}, each the largest of {size}.", super::format::grouped(lines.len()), super::format::grouped(data.f.len()))
+            format!(
+                "{} frequencies are drawn as {}, each the largest of {size}.",
+                super::format::grouped(lines.len()),
+                super::format::grouped(f.len())
+            )
         } else {
             String::new()
         },
     };
-    Some((data, words))
+    Some((
+        Spectrum {
+            f,
+            before,
+            after: (!same).then_some(after),
+        },
+        words,
+    ))
 }
 
 /// JSON that may stand inside a script element: nothing in it can end the element.
@@ -620,7 +783,9 @@ pub fn embed(data: &impl Serialize) -> String {
     let mut safe = String::with_capacity(json.len());
     for character in json.chars() {
         match character {
-            '<' | '>' | '&' | '\u{2028}' | '\u{2029}' => safe.push_str(&format!("\\u{:04x}", u32::from(character))),
+            '<' | '>' | '&' | '\u{2028}' | '\u{2029}' => {
+                safe.push_str(&format!("\\u{:04x}", u32::from(character)))
+            }
             _ => safe.push(character),
         }
     }

@@ -43,12 +43,31 @@
     return values.map((value) => (value === null ? "" : tick(value, step)));
   }
 
+  // Of a logarithmic axis: 1 … 9 of each decade; over less than a decade even steps. uPlot's own need whole decades.
+  function logSplits(u, index, min, max) {
+    const out = [];
+    if (max / min < 8) {
+      const raw = (max - min) / 6, power = Math.pow(10, Math.floor(Math.log10(raw)));
+      const step = [1, 2, 5, 10].map((k) => k * power).find((k) => k >= raw);
+      for (let k = Math.ceil(min / step); k * step <= max && out.length < 50; k++) out.push(k * step);
+      return out;
+    }
+    for (let power = Math.floor(Math.log10(min)); power <= Math.log10(max) && power < 308; power++) {
+      for (let k = 1; k < 10; k++) {
+        const value = k * Math.pow(10, power);
+        if (value >= min * (1 - 1e-9) && value <= max * (1 + 1e-9)) out.push(value);
+      }
+    }
+    return out;
+  }
   function logTicks(u, values) {
+    if (values.length > 1 && values[values.length - 1] / values[0] < 8) return ticks(u, values);
+    const decades = Math.log10(values[values.length - 1] / values[0]);
     return values.map((value) => {
       if (value === null) return "";
-      const power = Math.round(Math.log10(value));
-      return Math.abs(value / Math.pow(10, power) - 1) < 1e-6
-        ? (power >= -3 && power <= 4 ? String(+Math.pow(10, power).toPrecision(1)) : "1e" + power) : "";
+      const power = Math.floor(Math.log10(value) + 1e-9), mantissa = Math.round(value / Math.pow(10, power));
+      if (mantissa !== 1 && !(decades < 2 && (mantissa === 2 || mantissa === 5))) return "";
+      return power >= -3 && power <= 4 ? String(+(mantissa * Math.pow(10, power)).toPrecision(1)) : mantissa + "e" + power;
     });
   }
 
@@ -61,6 +80,7 @@
       grid: { stroke: () => colour("grid"), width: 1 },
       ticks: { stroke: () => colour("grid"), width: 1 },
       filter: log ? (u, splits) => splits : undefined,
+      splits: log ? logSplits : undefined,
     };
   }
 
@@ -83,8 +103,8 @@
     label, stroke: () => colour(name), width: 1.2, points: { show: false }, value: (u, v) => number(v), twinColour: name,
   }, extra);
 
-  const dots = (label, name, group) => Object.assign(line(label, name), {
-    width: 0, paths: () => null, twinGroup: group, class: "quiet",
+  const dots = (label, name) => Object.assign(line(label, name), {
+    width: 0, paths: () => null, twinGroup: name, class: "quiet",
     points: { show: true, size: 3, width: 0, stroke: () => clear(name, 0.4), fill: () => clear(name, 0.4) },
   });
 
@@ -105,6 +125,7 @@
       ctx.clip();
       ctx.fillStyle = colour("shade");
       ctx.strokeStyle = colour("shade-edge");
+      ctx.setLineDash([]);
       ctx.lineWidth = devicePixelRatio;
       for (const place of places) {
         const from = place.from === null ? u.bbox.left - 9 : u.valToPos(place.from, "x", true);
@@ -128,7 +149,7 @@
       };
       add("reference", "reference", { dash: [2, 3], show: false });
       add("recorded", "recorded", { width: 1.6 });
-      add("before", "simulated before", { dash: [7, 3] });
+      add("before", signal.values.after ? "simulated before" : "simulated", { dash: [7, 3] });
       add("after", "simulated after", {});
       return { data, series, group: "time", places: signal.places.filter((p) => p.kind === "time") };
     },
@@ -139,21 +160,21 @@
         data.push(decode(signal.residuals[key]));
         series.push(line(label, key, extra));
       };
-      add("before", "before", {});
+      add("before", signal.residuals.after ? "before" : "residual", {});
       add("after", signal.residuals.fitted ? "after, held out" : "after", {});
       add("fitted", "after, fitted", { show: false });
       return { data, series, group: "time", places: signal.places.filter((p) => p.kind === "time"), zero: true };
     },
     against(signal, index) {
       const one = signal.against[index];
-      const x = decode(one.x), before = decode(one.before), after = decode(one.after);
+      const x = decode(one.x), before = decode(one.before), after = one.after ? decode(one.after) : before;
       const bins = one.bins, rows = [];
       // Values of a flag would hide each other: before stands left of the value, after right of it.
       let gap = 0;
       if (bins.discrete) {
         gap = Infinity;
         for (let k = 1; k < bins.x.length; k++) gap = Math.min(gap, bins.x[k] - bins.x[k - 1]);
-        if (!isFinite(gap)) gap = 1;
+        if (!isFinite(gap)) gap = Math.max(1, Math.abs(bins.x[0]) / 1000);
       }
       const aside = 0.18 * gap;
       x.forEach((v, k) => {
@@ -171,17 +192,17 @@
       rows.sort((a, b) => a[0] - b[0]);
       const data = Array.from({ length: 9 }, (_, k) => rows.map((row) => row[k]));
       const hidden = gap ? { paths: () => null } : {};
-      const edge = (name, group) => line("", name, Object.assign({ width: 0, spanGaps: true, class: "quiet", twinGroup: group }, hidden));
-      const middle = (label, name, group) => line(label, name, Object.assign({ width: 2.5, spanGaps: true, twinGroup: group }, hidden));
+      const edge = (name) => line(name + ", 5 or 95 %", name, Object.assign({ width: 0, spanGaps: true, class: "quiet", twinGroup: name }, hidden));
+      const middle = (label, name) => line(label, name, Object.assign({ width: 2.5, spanGaps: true, twinGroup: name }, hidden));
       return {
         data, scatter: true, places: one.places, zero: true, margin: gap * 0.45,
         discrete: gap ? { aside, bins, width: gap * 0.1 } : null,
         series: [
           { label: one.variable, value: (u, v) => number(v) },
-          dots("", "before", "before"), dots("", "after", "after"),
-          edge("before", "before"), middle("before", "before", "before"), edge("before", "before"),
-          edge("after", "after"), middle("after", "after", "after"), edge("after", "after"),
-        ],
+          dots(one.after ? "before" : "residual", "before"), dots("after", "after"),
+          edge("before"), middle(one.after ? "before" : "residual", "before"), edge("before"),
+          edge("after"), middle("after", "after"), edge("after"),
+        ].map((series) => (series.twinColour === "after" && !one.after ? Object.assign(series, { show: false, class: "quiet", twinGroup: null }) : series)),
         bands: gap ? [] : [
           { series: [5, 3], fill: () => clear("before", 0.16) },
           { series: [8, 6], fill: () => clear("after", 0.16) },
@@ -191,11 +212,11 @@
     spectrum(signal) {
       const s = signal.spectrum;
       return {
-        data: [s.f, s.before, s.after], log: true, places: signal.places.filter((p) => p.kind === "frequency"),
+        data: s.after ? [s.f, s.before, s.after] : [s.f, s.before], log: true, places: signal.places.filter((p) => p.kind === "frequency"),
         series: [
           { label: "frequency", value: (u, v) => (v === null ? "–" : number(v) + " Hz") },
-          line("before", "before", { spanGaps: true }), line("after", "after", { spanGaps: true }),
-        ],
+          line(s.after ? "before" : "residual", "before", { spanGaps: true }),
+        ].concat(s.after ? [line("after", "after", { spanGaps: true })] : []),
       };
     },
   };
@@ -215,7 +236,8 @@
     if (min <= whole[0] && max >= whole[1]) { reset(u); return; }
     min = Math.max(min, whole[0]);
     max = Math.min(max, whole[1]);
-    if (!(max - min > 1e-9 * (whole[1] - whole[0]))) return;
+    // Nor further in than a fraction of a sample.
+    if (!(max - min > (0.2 / u.data[0].length) * (whole[1] - whole[0]))) return;
     u.setScale("x", { min, max });
   }
   function pan(u, share) {
@@ -232,6 +254,17 @@
   }
   function reset(u) {
     u.setScale("x", { min: u.twin.whole[0], max: u.twin.whole[1] });
+    if (!u.twin.scatter) return;
+    // Here dragging sets the height too, and it has to be given back.
+    let low = Infinity, high = -Infinity;
+    u.data.forEach((values, k) => {
+      if (k === 0 || !u.series[k].show) return;
+      for (const v of values) if (v !== null) { low = Math.min(low, v); high = Math.max(high, v); }
+    });
+    if (low <= high) {
+      const [min, max] = uPlot.rangeNum(low, high, 0.1, true);
+      u.setScale("y", { min, max });
+    }
   }
 
   let following = false;
@@ -347,9 +380,11 @@
       },
     };
     options.axes[0].size = 34;
+    // Long numbers need room.
+    options.axes[0].space = 40 + 5 * Math.max(number(whole[0]).length, number(Math.round(whole[1])).length);
     if (part.discrete) options.axes[0].splits = () => part.discrete.bins.x;
     const u = new uPlot(options, part.data, area);
-    u.twin = { group: part.group ? part.group + figure.dataset.signal : null, whole, zoomed: false, kind };
+    u.twin = { group: part.group ? part.group + figure.dataset.signal : null, whole, zoomed: false, scatter: !!part.scatter };
     u.setScale("x", { min: whole[0], max: whole[1] });
     // uPlot's own double click shows the data's range; this one the range that was drawn first.
     u.over.addEventListener("dblclick", () => reset(u));
@@ -391,6 +426,7 @@
     const y = Math.round(u.valToPos(0, "y", true)) + 0.5;
     u.ctx.save();
     u.ctx.strokeStyle = colour("soft");
+    u.ctx.setLineDash([]);
     u.ctx.lineWidth = devicePixelRatio;
     u.ctx.beginPath();
     u.ctx.moveTo(u.bbox.left, y);
