@@ -379,7 +379,6 @@ fn effects(bench: &Workbench<'_>, selection: &Selection, seed: u64) -> Vec<Effec
                     ci95: intervals[named.index][p],
                     off: Some(parameter.off).filter(|off| off.is_finite()),
                     unit: unit(bench.problem, parameter.unit),
-                    off: parameter.off.is_finite().then_some(parameter.off),
                 })
                 .collect();
             let separated: Vec<&str> = named
