@@ -31,9 +31,10 @@ fn recording(folder: &Path, seed: u64) {
     let mut uniform = move || f64::from(random.next_u32()) / f64::from(u32::MAX);
     let (mut current, mut target, mut left) = (0.0, 0.0, 0);
     let mut drive = "t_s,i_ref_a\n".to_owned();
-    for k in 0..3000 {
+    // As frames come: each 10 ms, a new reading in each third.
+    for k in 0..20_000 {
         if left == 0 {
-            left = 10 + (70.0 * uniform()) as u32;
+            left = 100 + (700.0 * uniform()) as u32;
             target = if uniform() < 0.2 {
                 0.0
             } else {
@@ -41,8 +42,8 @@ fn recording(folder: &Path, seed: u64) {
             };
         }
         left -= 1;
-        current += 0.2 * (target - current);
-        drive.push_str(&format!("{},{current}\n", f64::from(k) / 10.0));
+        current += 0.02 * (target - current);
+        drive.push_str(&format!("{},{current}\n", f64::from(k) / 100.0));
     }
     fs::write(folder.join("drive.csv"), drive).unwrap();
     let truth = format!("{BOARD}[effects.offset]\noffset_a = 1.5\n[effects.gain]\ngain = 1.02\n");
@@ -66,11 +67,14 @@ fn recording(folder: &Path, seed: u64) {
         read("simulated.csv", "i_meas_a"),
     );
     let mut text = "t_s,i_ref_a,i_meas_a\n".to_owned();
+    let (mut last, mut noise) = (f64::NAN, 0.0);
     for (row, (reference, reading)) in reference.iter().zip(&simulated).enumerate() {
-        let noise = 0.17 * (uniform() - 0.5);
+        if *reading != last {
+            (last, noise) = (*reading, 0.17 * (uniform() - 0.5));
+        }
         text.push_str(&format!(
             "{},{reference},{}\n",
-            row as f64 / 10.0,
+            row as f64 / 100.0,
             reading + noise
         ));
     }
@@ -133,7 +137,8 @@ fn writes_report_page_model_and_calibration() {
     };
     assert!((value("current gain") - (1.0 / 1.02 - 1.0) * 1e6).abs() < 2000.0);
     assert!((value("zero drift") - 1.5e6).abs() < 5e4);
-    // The extended model leaves nothing to explain, and says so.
+    // The extended model needs no more than its own file: what it leaves is the noise that it states, as the report
+    // showed, but for the alignment within a step of the rows, which is no part of the model.
     let arguments = [
         "explain",
         "--model",
@@ -144,15 +149,16 @@ fn writes_report_page_model_and_calibration() {
         "again",
     ];
     assert_eq!(twin(folder, &arguments).status.code(), Some(0));
-    let again: serde_json::Value =
-        serde_json::from_str(&fs::read_to_string(folder.join("again/report.json")).unwrap())
-            .unwrap();
-    let (before, after) = (&report["signals"][0], &again["signals"][0]);
-    let (found, kept) = (
-        before["rmse_after"].as_f64().unwrap(),
-        after["rmse_before"].as_f64().unwrap(),
+    let again = fs::read_to_string(folder.join("again/report.json")).unwrap();
+    let again: serde_json::Value = serde_json::from_str(&again).unwrap();
+    let figure =
+        |report: &serde_json::Value, name: &str| report["signals"][0][name].as_f64().unwrap();
+    let kept = figure(&again, "rmse_before");
+    assert!(figure(&report, "rmse_after") < 0.067, "{summary}");
+    assert!(
+        kept < 0.067 && kept < 0.05 * figure(&report, "rmse_before"),
+        "{kept}\n{summary}"
     );
-    assert!((found - kept).abs() < 1e-6 * found, "{found} and {kept}");
 }
 
 #[test]

@@ -97,6 +97,7 @@ pub(super) fn item(
         problem,
         rows,
         pace: Pace::Seen,
+        fresh: Vec::new(),
     }))
 }
 
