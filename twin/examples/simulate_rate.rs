@@ -2,7 +2,7 @@
 //!
 //! `cargo run -p twin --profile tool --example simulate_rate`
 
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::single_range_in_vec_init)]
 
 use std::time::Instant;
 

@@ -168,6 +168,22 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
         let start = Trial { shape, ..best };
         fine.take(fit.descend(start, step_s));
     }
+    // Edges that fall between two rows make many small valleys: look into the neighbouring ones.
+    for smoothing_s in [fine.smoothing_s, 0.0] {
+        let smooth = fit.smooth(fine.shape, smoothing_s);
+        let middle = fine;
+        for index in -80_i32..=80 {
+            let offset_s = middle.offset_s + f64::from(index) / 40.0 * step_s;
+            let cost = fit.cost(&smooth, offset_s, middle.drift_s);
+            fine.take(Trial {
+                smoothing_s,
+                offset_s,
+                cost,
+                ..middle
+            });
+        }
+    }
+    fine.take(fit.descend(fine, 0.05 * step_s));
     let smooth = fit.smooth(fine.shape, fine.smoothing_s);
     let correlation = fit.correlation(&smooth, fine.offset_s, fine.drift_s);
     if correlation.abs() < LEAST_CORRELATION {
@@ -291,9 +307,9 @@ fn derivative(signal: &Signal, grid_s: f64) -> Vec<f64> {
         means[cell] = sum[cell] / f64::from(count[cell]);
         if let Some(before) = known {
             let (from, to) = (means[before], means[cell]);
-            for between in before + 1..cell {
-                means[between] =
-                    from + (to - from) * (between - before) as f64 / (cell - before) as f64;
+            let cells = (cell - before) as f64;
+            for (index, mean) in means[before + 1..cell].iter_mut().enumerate() {
+                *mean = from + (to - from) * (index + 1) as f64 / cells;
             }
         }
         known = Some(cell);

@@ -20,7 +20,7 @@ pub use held::{Freshness, freshness};
 use crate::{
     align, explain,
     failure::Failure,
-    model::{FrontEndKind, Model, Sensor, registry},
+    model::{Model, Sensor, registry},
     problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View},
     simulate::board::{Board, Pace},
 };
@@ -60,6 +60,8 @@ pub struct Item {
     pub rows: Vec<usize>,
     /// When the board's conversions end, for a sensor.
     pub pace: Pace,
+    /// Rows at which a board's new conversion shows for the first time; empty: all.
+    pub fresh: Vec<bool>,
 }
 
 /// Everything that explaining and simulating need.
@@ -102,7 +104,7 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
         return Err(nothing_to_compare(model, &frame));
     }
     for item in &mut items {
-        model_effects(model, &mut item.problem);
+        model_effects(model, item);
         if purpose == Purpose::Compare {
             checks::enough(&item.problem, frame.source())?;
         }
@@ -206,7 +208,7 @@ impl Work<'_> {
         };
         if self.purpose == Purpose::Compare && value.is_some() {
             let (errors, remarks) = (
-                checks::pair(&drive, &observed, sensor, &reference, &measured),
+                checks::pair(&drive, &observed, &reference, &measured),
                 checks::plausible(&drive, &observed, sensor, &reference, &measured),
             );
             for remark in remarks {
@@ -227,7 +229,7 @@ impl Work<'_> {
             .unwrap_or("1")
             .to_owned();
         if value.is_some() || self.purpose == Purpose::Simulate {
-            let problem = self.sensor_problem(
+            let (problem, fresh) = self.sensor_problem(
                 sensor,
                 board.as_ref(),
                 &drive,
@@ -240,6 +242,7 @@ impl Work<'_> {
                 problem,
                 rows: rows.clone(),
                 pace,
+                fresh,
             });
         }
         if let Some(counter) = counter {
@@ -265,7 +268,8 @@ impl Work<'_> {
         pace: Pace,
         measured: &str,
         unit: &str,
-    ) -> Problem {
+    ) -> (Problem, Vec<bool>) {
+        let mut fresh = Vec::new();
         let mut drive = drive.clone();
         let mut observed = observed.clone();
         let mut base = SensorBase {
@@ -286,6 +290,7 @@ impl Work<'_> {
             let reported = board.run(&drive, sensor.held_reference, &observed, pace, false);
             self.compare_range_flag(board, &mut drive, &observed, &reported.range_high);
             base.reading = reported.current_a;
+            fresh = reported.fresh;
             let mut spoiled = 0;
             for (row, reading) in base.reading.iter().enumerate() {
                 if reading.is_nan() && observed.valid[row] {
@@ -300,7 +305,7 @@ impl Work<'_> {
             }
         }
         let step = base.step;
-        Problem {
+        let problem = Problem {
             view: View::Sensor,
             name: measured.to_owned(),
             unit: unit.to_owned(),
@@ -314,7 +319,8 @@ impl Work<'_> {
                 zero: sensor.accuracy.zero,
                 gain: sensor.accuracy.gain,
             },
-        }
+        };
+        (problem, fresh)
     }
 
     /// The range flag of the simulated board where none was recorded, and a remark where it differs from a recorded one.
@@ -473,9 +479,14 @@ impl Work<'_> {
         fresh: &Freshness,
     ) -> (Observed, Vec<usize>) {
         match (&self.clock, self.reference) {
-            (Some(clock), Some(_)) => {
-                series::own_rows(drive, clocks, &[0..clock.len()], clock, value, &fresh.rows)
-            }
+            (Some(clock), Some(_)) => series::own_rows(
+                drive,
+                clocks,
+                self.frame.clocks(),
+                clock,
+                value,
+                &fresh.rows,
+            ),
             _ => {
                 let frame = self.frame;
                 if series::share_rows(rows, value) {
@@ -496,7 +507,8 @@ impl Work<'_> {
 }
 
 /// Puts the effects of the model file into a problem, those that act in its view.
-fn model_effects(model: &Model, problem: &mut Problem) {
+fn model_effects(model: &Model, item: &mut Item) {
+    let problem = &mut item.problem;
     let battery = matches!(problem.view, View::StateOfCharge | View::Voltage);
     problem.modelled = model
         .effects
@@ -532,14 +544,14 @@ fn model_effects(model: &Model, problem: &mut Problem) {
         explain::predict(&plain, &effects),
         explain::predict(&plain, &[]),
     );
-    for (reading, (with, without)) in base.reading.iter_mut().zip(with.iter().zip(&without)) {
-        *reading += with - without;
+    // Between two conversions the board holds its reading, with what the effects made of it.
+    let mut held = 0.0;
+    for (row, reading) in base.reading.iter_mut().enumerate() {
+        if item.fresh.get(row).is_none_or(|fresh| *fresh) {
+            held = with[row] - without[row];
+        }
+        *reading += held;
     }
-}
-
-/// Whether a front end is one of the board's.
-pub fn is_board(kind: FrontEndKind) -> bool {
-    kind != FrontEndKind::Pair
 }
 
 /// A time in a remark.

@@ -207,7 +207,7 @@ fn a_missing_column() {
     let recording = good().replacen("i_meas_a", "board", 1);
     says(
         &explained(PAIR, &recording),
-        &["r.csv", "\"board\"", "i_meas_a"],
+        &["r.csv", "t_s, i_ref_a, board", "i_meas_a"],
     );
     let recording = good().replacen("i_ref_a", "shunt", 1);
     says(&explained(PAIR, &recording), &["r.csv", "shunt", "i_ref_a"]);

@@ -126,6 +126,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             },
             rows,
             pace: Pace::Free,
+            fresh: Vec::new(),
         });
     }
     Ok(items)

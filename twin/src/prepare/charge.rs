@@ -33,7 +33,7 @@ pub(super) fn item(
     let step_c = board.map_or(spec.step_c, Board::charge_step_c);
     let every = vec![true; value.len()];
     let (readings, rows) = match &work.clock {
-        Some(clock) => series::own_rows(drive, clocks, &[0..clock.len()], clock, &value, &every),
+        Some(clock) => series::own_rows(drive, clocks, work.frame.clocks(), clock, &value, &every),
         None => series::own_rows(
             drive,
             clocks,
@@ -98,6 +98,7 @@ pub(super) fn item(
         problem,
         rows,
         pace: Pace::Seen,
+        fresh: Vec::new(),
     }))
 }
 

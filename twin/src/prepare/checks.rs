@@ -61,7 +61,7 @@ pub(super) fn enough(problem: &Problem, source: &str) -> Result<(), Failure> {
                 .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), t| {
                     (low.min(*t), high.max(*t))
                 });
-            format!("{low} … {high} s")
+            format!("{} … {} s", shown(low), shown(high))
         };
         return Err(Failure::Input(format!(
             "{source}, column {}: found readings at {} and a reference at {}, expected both at the same time",
@@ -74,6 +74,11 @@ pub(super) fn enough(problem: &Problem, source: &str) -> Result<(), Failure> {
         "{source}, column {}: found {rows} readings to compare, expected at least {FEWEST_ROWS}",
         problem.name
     )))
+}
+
+/// A time without the digits that a sum of steps leaves behind.
+fn shown(t_s: f64) -> f64 {
+    (t_s * 1e6).round() / 1e6
 }
 
 /// Readings that count with the reference at their time.
@@ -160,7 +165,6 @@ fn thousands(ratio: f64) -> Option<i32> {
 pub(super) fn pair(
     drive: &Drive,
     observed: &Observed,
-    _sensor: &Sensor,
     reference: &str,
     measured: &str,
 ) -> Result<(), Failure> {

@@ -31,10 +31,18 @@ const SIGNAL_SPAN_V: f64 = 2.25;
 /// The pin's converter: 12 bits over 3.3 V (RM0090, ADC).
 const ADC1_STEP_V: f64 = 3.3 / 4096.0;
 
+/// Fewest conversions from which a grid is told.
+const FEWEST_OF_A_GRID: usize = 20;
+/// Share of the likeness that an even grid would show, from which there is one.
+const GRID_LIKE: f64 = 0.85;
+/// The ADS1100's clock may be off by a fifth (*assumed*, as `core-logic` has it).
+const CLOCK_WITHIN: f64 = 0.2;
+
 /// When conversions end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pace {
-    /// Where a new reading was seen: at the valid rows of the observation.
+    /// Where a new reading was seen: at the valid rows of the observation, or rather on the even grid that those tell
+    /// of, since a row sees a conversion up to one step late.
     Seen,
     /// Rows are further apart than conversions: half a conversion before each row, the mean of what can be.
     Between,
@@ -51,6 +59,8 @@ pub struct Reported {
     pub charge_c: Vec<f64>,
     /// Range flag: 1 for the large sensor.
     pub range_high: Vec<f64>,
+    /// True where a new conversion shows for the first time, and where one was seen.
+    pub fresh: Vec<bool>,
 }
 
 /// A board as designed.
@@ -206,6 +216,7 @@ impl Board {
             current_a: vec![f64::NAN; rows],
             charge_c: vec![f64::NAN; if charge { rows } else { 0 }],
             range_high: vec![f64::NAN; rows],
+            fresh: vec![false; rows],
         };
         let mut row = 0;
         let mut counted_before_c = 0.0;
@@ -274,13 +285,19 @@ impl Board {
         for back in (0..length).rev() {
             chain.conversion(first.start_s - back as f64 * period_s);
         }
-        let mut before_s = first.start_s;
+        let (start, mut before_s) = (rows.start, first.start_s);
+        let mut ends = match pace {
+            Pace::Seen => ends(observed, rows.clone(), period_s),
+            _ => Vec::new(),
+        }
+        .into_iter();
         for row in rows {
             let now_s = observed.t_s[row];
+            let converted = chain.conversions;
             match pace {
                 Pace::Seen => {
                     if observed.valid[row] {
-                        chain.conversion(now_s);
+                        chain.conversion(ends.next().unwrap_or(now_s));
                     }
                 }
                 Pace::Between => {
@@ -300,6 +317,8 @@ impl Board {
             }
             before_s = now_s;
             reported.current_a[row] = chain.value;
+            let seen = pace == Pace::Seen && observed.valid[row];
+            reported.fresh[row] = seen || chain.conversions != converted || row == start;
             reported.range_high[row] = f64::from(u8::from(chain.range == SensorRange::Large));
         }
     }
@@ -356,6 +375,83 @@ impl Board {
         }
         total
     }
+}
+
+/// When the conversions ended that valid rows saw for the first time: on a grid of their own if the changes of the
+/// reading fit one, else at the rows.
+fn ends(observed: &Observed, rows: std::ops::Range<usize>, period_s: f64) -> Vec<f64> {
+    let valid: Vec<usize> = rows.clone().filter(|row| observed.valid[*row]).collect();
+    let times = || valid.iter().map(|row| observed.t_s[*row]);
+    let mut steps: Vec<f64> = observed.t_s[rows]
+        .windows(2)
+        .map(|pair| pair[1] - pair[0])
+        .collect();
+    if valid.len() < FEWEST_OF_A_GRID || steps.is_empty() {
+        return times().collect();
+    }
+    let middle = steps.len() / 2;
+    let step_s = *steps.select_nth_unstable_by(middle, f64::total_cmp).1;
+    // Without repeats between them the rows tell nothing of a grid.
+    if step_s <= 0.0 || step_s > 0.75 * period_s || valid.len() * 5 > observed.t_s.len() * 4 {
+        return times().collect();
+    }
+    // A value that stayed tells nothing either.
+    let changes: Vec<f64> = valid
+        .windows(2)
+        .filter(|pair| observed.value[pair[0]] != observed.value[pair[1]])
+        .map(|pair| observed.t_s[pair[1]])
+        .collect();
+    match grid(&changes, period_s, step_s) {
+        Some((grid_s, start_s)) => times()
+            .map(|t| start_s + ((t - start_s) / grid_s + 1e-6).floor() * grid_s)
+            .collect(),
+        None => times().collect(),
+    }
+}
+
+/// Period and phase of the grid from which rows `step_s` apart see changes, each late by less than that.
+fn grid(changes: &[f64], period_s: f64, step_s: f64) -> Option<(f64, f64)> {
+    let start_s = *changes.first()?;
+    // How alike the phases are, 0 … 1, and their mean.
+    let phase = |used: &[f64], trial_s: f64| {
+        let (mut x, mut y) = (0.0, 0.0);
+        for t in used {
+            let angle = std::f64::consts::TAU * (t - start_s) / trial_s;
+            x += angle.cos();
+            y += angle.sin();
+        }
+        (x.hypot(y) / used.len() as f64, y.atan2(x))
+    };
+    // A wide range of periods for the first few, then more of them and a finer one.
+    let mut count = FEWEST_OF_A_GRID.min(changes.len());
+    let mut best_s = period_s;
+    let mut width = CLOCK_WITHIN;
+    loop {
+        let used = &changes[..count];
+        let cycles = ((used[count - 1] - start_s) / best_s).max(1.0);
+        let tries = (width * cycles * 10.0).ceil().clamp(10.0, 2000.0) as i32;
+        let (mut best, middle_s) = (0.0, best_s);
+        for index in -tries..=tries {
+            let trial_s = middle_s * (1.0 + width * f64::from(index) / f64::from(tries));
+            let alike = phase(used, trial_s).0;
+            if alike > best {
+                (best, best_s) = (alike, trial_s);
+            }
+        }
+        if count == changes.len() {
+            break;
+        }
+        width = 0.3 / cycles;
+        count = (2 * count).min(changes.len());
+    }
+    let (alike, angle) = phase(changes, best_s);
+    // Evenly late by up to a step, phases are as alike as sin(x)/x of half of it.
+    let half = std::f64::consts::PI * step_s / best_s;
+    if alike < GRID_LIKE * half.sin() / half {
+        return None;
+    }
+    let mean_s = angle / std::f64::consts::TAU * best_s;
+    Some((best_s, start_s + mean_s - 0.5 * step_s))
 }
 
 /// Cuts the current into pieces of the signal.
@@ -520,6 +616,7 @@ struct Chain<'a> {
     /// Zero of the board's clock.
     clock_s: f64,
     value: f64,
+    conversions: u64,
     range: SensorRange,
     configuration: u8,
 }
@@ -536,6 +633,7 @@ impl<'a> Chain<'a> {
             average: SlidingAverage::new(),
             clock_s: clock_s - reach_s,
             value: f64::NAN,
+            conversions: 0,
             range: SensorRange::Small,
             configuration: board.configuration.converter.expected_configuration(),
         }
@@ -592,6 +690,7 @@ impl<'a> Chain<'a> {
         let Some(reading) = reading else {
             return;
         };
+        self.conversions += 1;
         let amps = |current: core_logic::units::Microamps| f64::from(current.get()) * 1e-6;
         if board.average.length > 1 {
             self.average.push(&board.average, &reading);
