@@ -63,7 +63,7 @@ pub(super) fn item(
         full_scale: sensor.full_scale,
         range_limit: sensor.range_limit,
         held_reference: sensor.held_reference,
-            alignment_s: sensor.alignment_s,
+        alignment_s: sensor.alignment_s,
         ..SensorBase::default()
     };
     let mut drive = drive;

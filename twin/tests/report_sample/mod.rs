@@ -264,6 +264,7 @@ pub fn partly_explained_of(rows: usize) -> Report {
     lag.equivalent_to = vec!["moving-average".to_owned()];
     lag.separated_by = "a current step sampled every 0.1 s or faster while the range flag stays the same: a lag decays, a moving average ends sharply.".to_owned();
     Report {
+        models: Vec::new(),
         schema: 1,
         verdict: Verdict::PartlyExplained,
         summary: format!(
