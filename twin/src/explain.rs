@@ -33,6 +33,8 @@ const LEFT: f64 = 0.1;
 /// From this ratio of what is left explainable to what the named effects explain on, their names are not to be trusted: another
 /// physics of the same shape would leave as much.
 const DOUBTFUL: f64 = 0.12;
+/// An effect that makes the error in another file larger by this factor is not that file's physics.
+const WORSE: f64 = 1.05;
 /// Folds for the figures of held-out blocks, each with a fit of its own.
 const FOLDS: usize = 5;
 
@@ -166,6 +168,7 @@ fn one(
     let features = Features::new(&bench);
     let before = features.explain(&selection.plain.residual, options.seed);
     let left = features.explain(&selection.fit.residual, options.seed);
+    veto(&bench, &mut selection, problem, holdouts);
     let verdict = judge(&bench, &mut selection, before, left);
     let model = &selection.fit.model;
 
@@ -230,6 +233,59 @@ fn one(
 
 fn jumps(residual: &[f64]) -> Vec<f64> {
     residual.windows(2).map(|pair| pair[1] - pair[0]).collect()
+}
+
+/// Takes effects out again that make the prediction of files that were never fitted worse.
+fn veto(bench: &Workbench<'_>, selection: &mut Selection, problem: &Problem, holdouts: &[Holdout]) {
+    let others: Vec<&Problem> = holdouts
+        .iter()
+        .flat_map(|holdout| &holdout.problems)
+        .filter(|other| other.name == problem.name)
+        .collect();
+    if others.is_empty() {
+        return;
+    }
+    let worst = |with: &Model, without: &Model| -> f64 {
+        others
+            .iter()
+            .map(|other| {
+                let bench = Workbench::new(other, &[]);
+                let rmse =
+                    |model: &Model| rms(bench.residual(&bench.run(&elsewhere(model))).into_iter());
+                rmse(with) / rmse(without).max(1e-300)
+            })
+            .fold(0.0, f64::max)
+    };
+    while !selection.named.is_empty() {
+        let found = (0..selection.fit.model.members.len())
+            .map(|index| {
+                let without = fit::fit(bench, &selection.fit.model.without(index), None);
+                let ratio = worst(&selection.fit.model, &without.model);
+                (index, without, ratio)
+            })
+            .max_by(|a, b| a.2.total_cmp(&b.2));
+        let Some((index, without, ratio)) = found.filter(|(_, _, ratio)| *ratio > WORSE) else {
+            return;
+        };
+        selection.refused.push(format!(
+            "{}: fits here, but makes the error in a file that was not fitted {:.2} times as large",
+            selection.fit.model.members[index].id(),
+            ratio
+        ));
+        selection.fit = fit::polish(bench, &without);
+        selection.rename(bench);
+    }
+}
+
+/// The model as it is taken to another file: how a file starts is its own, the physics is not.
+fn elsewhere(model: &Model) -> Model {
+    Model {
+        nuisance: Nuisance {
+            soc_shift: 0.0,
+            ..model.nuisance
+        },
+        ..model.clone()
+    }
 }
 
 /// The verdict on one signal. Where the names are not to be trusted, the effects are taken back.
@@ -406,14 +462,7 @@ fn effects(bench: &Workbench<'_>, selection: &Selection, seed: u64) -> Vec<Effec
 
 fn held_out_file(holdout: &Holdout, other: &Problem, model: &Model) -> HoldoutReport {
     let bench = Workbench::new(other, &[]);
-    // How the file starts is its own (charge, alignment of samples), the physics is not.
-    let model = Model {
-        nuisance: Nuisance {
-            soc_shift: 0.0,
-            ..model.nuisance
-        },
-        ..model.clone()
-    };
+    let model = elsewhere(model);
     HoldoutReport {
         file: holdout.file.display().to_string(),
         signal: other.name.clone(),

@@ -16,7 +16,7 @@ pub struct Line {
 /// Longest grid.
 const MOST: usize = 1 << 20;
 /// Frequencies to each side that a line is compared with.
-const NEIGHBOURS: usize = 50;
+const NEIGHBOURS: usize = 60;
 /// A line as strong as this is found by chance once in a thousand recordings.
 const CHANCE: f64 = 1e-3;
 /// Lines that are returned.
@@ -53,10 +53,14 @@ fn grid(t_s: &[f64], values: &[f64], step_s: f64) -> Option<(Vec<Complex<f64>>, 
 
 /// Lines that stand out of the spectrum around them by more than chance makes of noise.
 pub fn lines(t_s: &[f64], values: &[f64], step_s: f64) -> Vec<Line> {
-    let Some((mut grid, first, filled)) = grid(t_s, values, step_s) else {
+    let Some((mut grid, _, filled)) = grid(t_s, values, step_s) else {
         return Vec::new();
     };
     let count = grid.len();
+    // Hann's window: what a strong line leaks is no line.
+    for (k, cell) in grid.iter_mut().enumerate() {
+        cell.re *= 0.5 - 0.5 * (std::f64::consts::TAU * k as f64 / count as f64).cos();
+    }
     // A finer grid of frequencies than 1/T, so that a line between two of them is not lost.
     let length = 2 * count;
     grid.resize(length, Complex::new(0.0, 0.0));
@@ -74,7 +78,7 @@ pub fn lines(t_s: &[f64], values: &[f64], step_s: f64) -> Vec<Line> {
         }
         let around = at.saturating_sub(2 * NEIGHBOURS).max(1)..(at + 2 * NEIGHBOURS).min(half);
         let mut others: Vec<f64> = around
-            .filter(|other| other.abs_diff(at) > 4)
+            .filter(|other| other.abs_diff(at) > 10)
             .map(|other| power[other])
             .collect();
         if others.len() < 20 {
@@ -89,7 +93,13 @@ pub fn lines(t_s: &[f64], values: &[f64], step_s: f64) -> Vec<Line> {
         }
     }
     found.sort_unstable_by(|a, b| b.1.total_cmp(&a.1));
-    found
+    let mut apart: Vec<(usize, f64)> = Vec::new();
+    for (at, power) in found {
+        if apart.iter().all(|(other, _)| other.abs_diff(at) > 12) {
+            apart.push((at, power));
+        }
+    }
+    apart
         .into_iter()
         .take(LINES)
         .map(|(at, _)| {
@@ -113,7 +123,6 @@ pub fn lines(t_s: &[f64], values: &[f64], step_s: f64) -> Vec<Line> {
                 sine += value * (turn * t).sin();
                 cosine += value * (turn * t).cos();
             }
-            let _ = first;
             let share = 2.0 / filled.max(1) as f64;
             Line {
                 frequency_hz,

@@ -55,10 +55,27 @@ pub struct Selection {
     pub fit: Fit,
     /// Its effects.
     pub named: Vec<Named>,
+    /// Ids of `named`.
+    ids: Vec<&'static str>,
     /// How it was decided.
     pub decisions: Vec<String>,
     /// Candidates that could not be accepted though they were the best at their step, and why not.
     pub refused: Vec<String>,
+}
+
+impl Selection {
+    /// Asks anew what speaks for each effect, after the model was changed.
+    pub fn rename(&mut self, bench: &Workbench<'_>) {
+        let p99: Vec<(&'static str, f64)> = self
+            .named
+            .iter()
+            .zip(&self.ids)
+            .map(|(named, id)| (*id, named.placebo_p99))
+            .collect();
+        let others = swapped(bench, &self.fit);
+        self.named = name(bench, &self.fit, &others, &p99);
+        self.ids = self.fit.model.ids();
+    }
 }
 
 /// Held-out loss of a fit by row, and in all.
@@ -153,6 +170,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
     };
     Selection {
         plain,
+        ids: now.model.ids(),
         fit: now,
         named,
         decisions,
