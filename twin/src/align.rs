@@ -1,0 +1,739 @@
+//! Two clocks: offset and rate between a sensor's time and its reference's, estimated from the two signals.
+//!
+//! 1. Coarse: cross-correlation of the derivatives on a common grid, all offsets at which enough overlaps.
+//! 2. Rate: the best offset of each of several blocks, and a line through them.
+//! 3. Fine: least squares over offset, rate and a smoothing of the reference (a first-order lag or a moving average,
+//!    whichever fits better), with gain and zero solved within. Without the smoothing a lag would be taken for a shift.
+
+/// Points of the coarse grids: on a fine one the noise between two points hides a slow sensor, on a coarse one a fast
+/// sensor's edges are lost. The one on which the signals are most alike counts.
+const GRIDS: [usize; 4] = [4096, 1024, 256, 64];
+/// Share of the shorter signal that has to overlap.
+const LEAST_OVERLAP: f64 = 0.25;
+/// Correlation of the derivatives below which nothing was found, …
+const LEAST_CORRELATION: f64 = 0.2;
+/// … unless it stands out by this many times the rms over all offsets.
+const STANDS_OUT: f64 = 6.0;
+/// Correlation of the values themselves that is no chance among thousands of offsets.
+const SCAN_CORRELATION: f64 = 0.6;
+/// Fastest clock error that is looked for, in 1: crystals are within 100 ppm, cheap loggers within 500.
+const FASTEST_RATE: f64 = 500e-6;
+/// Readings that the fine fit uses at most.
+const FIT_ROWS: usize = 20_000;
+/// Beyond this share of the signal's spread a residual counts in proportion and not squared.
+const HUBER_SHARE: f64 = 0.1;
+/// Blocks that the rate is taken from.
+const BLOCKS: usize = 6;
+
+/// A series with its times, ascending.
+#[derive(Clone, Debug, Default)]
+pub struct Signal {
+    t_s: Vec<f64>,
+    value: Vec<f64>,
+}
+
+impl Signal {
+    /// The rows that have a value and are to be used.
+    pub fn new(t_s: &[f64], value: &[f64], uses: impl Fn(usize) -> bool) -> Self {
+        let mut signal = Self::default();
+        for row in (0..t_s.len()).filter(|row| value[*row].is_finite() && uses(*row)) {
+            // Two rows of the same time: the later one counts.
+            if signal.t_s.last() == Some(&t_s[row]) {
+                signal.t_s.pop();
+                signal.value.pop();
+            }
+            signal.t_s.push(t_s[row]);
+            signal.value.push(value[row]);
+        }
+        signal
+    }
+
+    fn span_s(&self) -> f64 {
+        match (self.t_s.first(), self.t_s.last()) {
+            (Some(first), Some(last)) => last - first,
+            _ => 0.0,
+        }
+    }
+
+    fn step_s(&self) -> f64 {
+        let mut steps: Vec<f64> = self.t_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        if steps.is_empty() {
+            return 0.0;
+        }
+        let middle = steps.len() / 2;
+        *steps.select_nth_unstable_by(middle, f64::total_cmp).1
+    }
+}
+
+/// How the reference is smoothed before it is compared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Shape {
+    Lag,
+    Average,
+}
+
+/// How the sensor's clock stands to the reference's.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Alignment {
+    /// What has to be added to the sensor's time at its first reading, in s.
+    pub offset_s: f64,
+    /// By how much the sensor's clock runs fast, in ppm.
+    pub fast_ppm: f64,
+    /// First time of the sensor, in s on its own clock.
+    pub start_s: f64,
+    /// Correlation of the two signals after all.
+    pub correlation: f64,
+}
+
+impl Alignment {
+    /// A time of the sensor on the reference's clock.
+    pub fn on_reference(&self, t_s: f64) -> f64 {
+        let since = t_s - self.start_s;
+        self.start_s + self.offset_s + since / (1.0 + self.fast_ppm * 1e-6)
+    }
+
+    /// What is said of it in the report.
+    pub fn remark(&self) -> String {
+        format!(
+            "the clocks of sensor and reference were compared: the sensor's time is {:+.6} s from the reference's at its \
+             first reading and runs {} by {:.1} ppm; both are taken out (correlation {:.4} after that)",
+            -self.offset_s,
+            if self.fast_ppm < 0.0 { "slow" } else { "fast" },
+            self.fast_ppm.abs(),
+            self.correlation
+        )
+    }
+}
+
+/// Finds how the clocks stand to each other; the error says that the two have nothing in common.
+pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
+    if driven.t_s.len() < 20 || sensed.t_s.len() < 20 {
+        return Err(format!(
+            "found {} values of the reference and {} of the sensor, expected at least 20 of each to compare their clocks",
+            driven.t_s.len(),
+            sensed.t_s.len()
+        ));
+    }
+    let thin = thinned(sensed);
+    let spread = spread(&thin.value).max(f64::MIN_POSITIVE);
+    let fit = Fit {
+        driven,
+        sensed: &thin,
+        start_s: sensed.t_s.first().copied().unwrap_or(0.0),
+        span_s: sensed.span_s().max(1e-9),
+        huber: HUBER_SHARE * spread,
+    };
+    let step_s = thin.step_s().max(driven.step_s()).max(1e-9);
+    let (coarse_s, grid_s) = coarse(driven, sensed)
+        .or_else(|| fit.scan(step_s))
+        .ok_or_else(|| nothing_in_common(driven, sensed))?;
+    // Smoothing and offset by trial; the rate is still unknown, so only its middle matters.
+    let mut best = Trial::worst();
+    for shape in [Shape::Lag, Shape::Average] {
+        for smoothing_s in
+            [0.0, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0].map(|steps| steps * step_s)
+        {
+            if smoothing_s > fit.span_s / 10.0 || (smoothing_s == 0.0 && shape == Shape::Average) {
+                continue;
+            }
+            let smooth = fit.smooth(shape, smoothing_s);
+            let reach_s = 3.0 * grid_s + smoothing_s;
+            let tries = 40;
+            for index in 0..=tries {
+                let offset_s =
+                    coarse_s + reach_s * (2.0 * f64::from(index) / f64::from(tries) - 1.0);
+                let cost = fit.cost(&smooth, offset_s, 0.0);
+                best.take(Trial {
+                    shape,
+                    smoothing_s,
+                    offset_s,
+                    drift_s: 0.0,
+                    cost,
+                });
+            }
+        }
+    }
+    let smooth = fit.smooth(best.shape, best.smoothing_s);
+    if let Some((offset_s, drift_s)) = fit.blocks(&smooth, best.offset_s, grid_s, step_s) {
+        let cost = fit.cost(&smooth, offset_s, drift_s);
+        best.take(Trial {
+            offset_s,
+            drift_s,
+            cost,
+            ..best
+        });
+    }
+    let mut fine = best;
+    for shape in [Shape::Lag, Shape::Average] {
+        let start = Trial { shape, ..best };
+        fine.take(fit.descend(start, step_s));
+    }
+    // Edges that fall between two rows make many small valleys: look into the neighbouring ones.
+    for smoothing_s in [fine.smoothing_s, 0.0] {
+        let smooth = fit.smooth(fine.shape, smoothing_s);
+        let middle = fine;
+        for index in -80_i32..=80 {
+            let offset_s = middle.offset_s + f64::from(index) / 40.0 * step_s;
+            let cost = fit.cost(&smooth, offset_s, middle.drift_s);
+            fine.take(Trial {
+                smoothing_s,
+                offset_s,
+                cost,
+                ..middle
+            });
+        }
+    }
+    fine.take(fit.descend(fine, 0.05 * step_s));
+    let smooth = fit.smooth(fine.shape, fine.smoothing_s);
+    let correlation = fit.correlation(&smooth, fine.offset_s, fine.drift_s);
+    if correlation.abs() < LEAST_CORRELATION {
+        return Err(nothing_in_common(driven, sensed));
+    }
+    let rate = fine.drift_s / fit.span_s;
+    Ok(Alignment {
+        offset_s: fine.offset_s,
+        fast_ppm: (1.0 / (1.0 + rate) - 1.0) * 1e6,
+        start_s: fit.start_s,
+        correlation,
+    })
+}
+
+fn nothing_in_common(driven: &Signal, sensed: &Signal) -> String {
+    let span = |signal: &Signal| match (signal.t_s.first(), signal.t_s.last()) {
+        (Some(first), Some(last)) => format!("{first} … {last} s"),
+        _ => "no time".to_owned(),
+    };
+    format!(
+        "found no offset at which the sensor ({}) follows the reference ({}), expected recordings that overlap in time",
+        span(sensed),
+        span(driven)
+    )
+}
+
+/// Offset of the highest correlation of the derivatives, and the grid's step.
+fn coarse(driven: &Signal, sensed: &Signal) -> Option<(f64, f64)> {
+    let longest_s = driven.span_s().max(sensed.span_s());
+    let finest_s = driven.step_s().min(sensed.step_s());
+    let mut best: Option<(f64, f64, f64)> = None;
+    for grid in GRIDS {
+        let grid_s = (longest_s / grid as f64).max(finest_s).max(1e-9);
+        if let Some((score, offset_s)) = correlate(driven, sensed, grid_s)
+            && best.is_none_or(|(known, ..)| score > known)
+        {
+            best = Some((score, offset_s, grid_s));
+        }
+    }
+    best.map(|(_, offset_s, grid_s)| (offset_s, grid_s))
+}
+
+/// The highest correlation of the derivatives on one grid and its offset; `None` if it does not stand out.
+fn correlate(driven: &Signal, sensed: &Signal, grid_s: f64) -> Option<(f64, f64)> {
+    let x = derivative(driven, grid_s);
+    let y = derivative(sensed, grid_s);
+    let shorter = x.len().min(y.len());
+    let least = ((shorter as f64 * LEAST_OVERLAP) as usize).max(8);
+    let squares = |values: &[f64]| -> Vec<f64> {
+        let mut sum = 0.0;
+        let mut all = vec![0.0];
+        all.extend(values.iter().map(|value| {
+            sum += value * value;
+            sum
+        }));
+        all
+    };
+    let (squares_x, squares_y) = (squares(&x), squares(&y));
+    let mut scores = Vec::new();
+    // y[k] beside x[k + lag].
+    let (first, last) = (-(y.len() as isize), x.len() as isize);
+    for lag in first..=last {
+        let from = (-lag).max(0) as usize;
+        let to = y.len().min((x.len() as isize - lag).max(0) as usize);
+        if to < from + least {
+            continue;
+        }
+        let shifted = (from as isize + lag) as usize;
+        let length = to - from;
+        let product: f64 = y[from..to]
+            .iter()
+            .zip(&x[shifted..shifted + length])
+            .map(|(y, x)| y * x)
+            .sum();
+        let energy =
+            (squares_x[shifted + length] - squares_x[shifted]) * (squares_y[to] - squares_y[from]);
+        if energy <= 0.0 {
+            continue;
+        }
+        // Among equals (a periodic load) the one that most of both takes part in.
+        let share = (length as f64 / shorter as f64).min(1.0).sqrt();
+        scores.push((product / energy.sqrt() * share, lag));
+    }
+    let (best, lag) = scores
+        .iter()
+        .copied()
+        .max_by(|one, other| one.0.abs().total_cmp(&other.0.abs()))?;
+    let total: f64 = scores.iter().map(|(score, _)| score * score).sum();
+    let rms = (total / scores.len() as f64).sqrt();
+    // Chance alone reaches about 1/√n, and the largest of many tries some times that.
+    let chance = STANDS_OUT / (shorter as f64).sqrt();
+    if best.abs() < LEAST_CORRELATION.max(chance.min(0.7)) && best.abs() < STANDS_OUT * rms {
+        return None;
+    }
+    let origin = |signal: &Signal| signal.t_s.first().copied().unwrap_or(0.0);
+    Some((
+        best.abs(),
+        origin(driven) - origin(sensed) + lag as f64 * grid_s,
+    ))
+}
+
+/// Differences of the means over the cells of a grid that begins at the first row.
+fn derivative(signal: &Signal, grid_s: f64) -> Vec<f64> {
+    let Some(start) = signal.t_s.first() else {
+        return Vec::new();
+    };
+    let cells = (signal.span_s() / grid_s) as usize + 1;
+    let mut sum = vec![0.0; cells];
+    let mut count = vec![0_u32; cells];
+    for (t, value) in signal.t_s.iter().zip(&signal.value) {
+        let cell = (((t - start) / grid_s) as usize).min(cells - 1);
+        sum[cell] += value;
+        count[cell] += 1;
+    }
+    let mut known: Option<usize> = None;
+    let mut means = vec![0.0; cells];
+    for cell in 0..cells {
+        if count[cell] == 0 {
+            continue;
+        }
+        means[cell] = sum[cell] / f64::from(count[cell]);
+        if let Some(before) = known {
+            let (from, to) = (means[before], means[cell]);
+            let cells = (cell - before) as f64;
+            for (index, mean) in means[before + 1..cell].iter_mut().enumerate() {
+                *mean = from + (to - from) * (index + 1) as f64 / cells;
+            }
+        }
+        known = Some(cell);
+    }
+    means.windows(2).map(|pair| pair[1] - pair[0]).collect()
+}
+
+fn thinned(signal: &Signal) -> Signal {
+    let every = signal.t_s.len().div_ceil(FIT_ROWS).max(1);
+    Signal {
+        t_s: signal.t_s.iter().copied().step_by(every).collect(),
+        value: signal.value.iter().copied().step_by(every).collect(),
+    }
+}
+
+fn spread(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    match (
+        sorted.get(sorted.len() / 50),
+        sorted.get(sorted.len() - 1 - sorted.len() / 50),
+    ) {
+        (Some(low), Some(high)) if high > low => high - low,
+        _ => sorted.last().unwrap_or(&0.0) - sorted.first().unwrap_or(&0.0),
+    }
+}
+
+/// A point of the search.
+#[derive(Clone, Copy, Debug)]
+struct Trial {
+    shape: Shape,
+    smoothing_s: f64,
+    offset_s: f64,
+    /// What the offset has changed by at the last reading, in s.
+    drift_s: f64,
+    cost: f64,
+}
+
+impl Trial {
+    fn worst() -> Self {
+        Self {
+            shape: Shape::Lag,
+            smoothing_s: 0.0,
+            offset_s: 0.0,
+            drift_s: 0.0,
+            cost: f64::INFINITY,
+        }
+    }
+
+    fn take(&mut self, other: Self) {
+        if other.cost < self.cost {
+            *self = other;
+        }
+    }
+}
+
+struct Fit<'a> {
+    driven: &'a Signal,
+    sensed: &'a Signal,
+    start_s: f64,
+    span_s: f64,
+    huber: f64,
+}
+
+impl Fit<'_> {
+    /// The reference, smoothed, at its own rows.
+    fn smooth(&self, shape: Shape, smoothing_s: f64) -> Vec<f64> {
+        let (t_s, value) = (&self.driven.t_s, &self.driven.value);
+        let mut output = value.clone();
+        if smoothing_s <= 0.0 {
+            return output;
+        }
+        match shape {
+            Shape::Lag => {
+                // Exact for straight lines between rows.
+                for row in 1..value.len() {
+                    let h = t_s[row] - t_s[row - 1];
+                    let kept = (-h / smoothing_s).exp();
+                    let (from, rise) = (value[row - 1], value[row] - value[row - 1]);
+                    let ramp = 1.0 - smoothing_s / h * (1.0 - kept);
+                    output[row] = kept * output[row - 1] + (1.0 - kept) * from + rise * ramp;
+                }
+            }
+            Shape::Average => {
+                let mut area = vec![0.0; value.len()];
+                for row in 1..value.len() {
+                    let h = t_s[row] - t_s[row - 1];
+                    area[row] = area[row - 1] + 0.5 * (value[row] + value[row - 1]) * h;
+                }
+                let mut at = 0;
+                for row in 0..value.len() {
+                    let from_s = t_s[row] - smoothing_s;
+                    while at + 1 < row && t_s[at + 1] <= from_s {
+                        at += 1;
+                    }
+                    let since = from_s - t_s[at];
+                    let before = if since <= 0.0 {
+                        area[at] + value[at] * since
+                    } else {
+                        let h = t_s[at + 1] - t_s[at];
+                        let end = value[at] + (value[at + 1] - value[at]) * since / h;
+                        area[at] + 0.5 * (value[at] + end) * since
+                    };
+                    output[row] = (area[row] - before) / smoothing_s;
+                }
+            }
+        }
+        output
+    }
+
+    /// The smoothed reference beside each reading of `rows` that it covers.
+    fn beside(
+        &self,
+        smooth: &[f64],
+        offset_s: f64,
+        drift_s: f64,
+        rows: std::ops::Range<usize>,
+        mut take: impl FnMut(f64, f64),
+    ) {
+        let t_ref = &self.driven.t_s;
+        let mut at = 0;
+        for row in rows {
+            let t = self.sensed.t_s[row];
+            let wanted = t + offset_s + drift_s * (t - self.start_s) / self.span_s;
+            if at == 0 {
+                at = t_ref.partition_point(|t| *t <= wanted).saturating_sub(1);
+            }
+            while at + 1 < t_ref.len() && t_ref[at + 1] <= wanted {
+                at += 1;
+            }
+            if wanted < t_ref[at] || at + 1 >= t_ref.len() {
+                continue;
+            }
+            let share = (wanted - t_ref[at]) / (t_ref[at + 1] - t_ref[at]);
+            take(
+                smooth[at] + (smooth[at + 1] - smooth[at]) * share,
+                self.sensed.value[row],
+            );
+        }
+    }
+
+    fn sums(
+        &self,
+        smooth: &[f64],
+        offset_s: f64,
+        drift_s: f64,
+        rows: std::ops::Range<usize>,
+    ) -> Sums {
+        let mut sums = Sums::default();
+        self.beside(smooth, offset_s, drift_s, rows, |x, y| sums.add(x, y));
+        sums
+    }
+
+    fn all(&self) -> std::ops::Range<usize> {
+        0..self.sensed.t_s.len()
+    }
+
+    fn correlation(&self, smooth: &[f64], offset_s: f64, drift_s: f64) -> f64 {
+        self.sums(smooth, offset_s, drift_s, self.all())
+            .correlation()
+    }
+
+    /// Mean cost of the residual after gain and zero.
+    fn cost(&self, smooth: &[f64], offset_s: f64, drift_s: f64) -> f64 {
+        let sums = self.sums(smooth, offset_s, drift_s, self.all());
+        let least = (LEAST_OVERLAP * 0.5 * self.sensed.t_s.len() as f64).max(10.0);
+        if sums.count < least.min(0.5 * self.sensed.t_s.len() as f64) {
+            return f64::INFINITY;
+        }
+        let Some((gain, zero)) = sums.line() else {
+            return f64::INFINITY;
+        };
+        let mut cost = 0.0;
+        self.beside(smooth, offset_s, drift_s, self.all(), |x, y| {
+            let residual = (y - zero - gain * x).abs();
+            cost += if residual <= self.huber {
+                0.5 * residual * residual
+            } else {
+                self.huber * (residual - 0.5 * self.huber)
+            };
+        });
+        cost / sums.count
+    }
+
+    /// Every offset, tried on the values themselves: for a sensor so slow beside its load that it has no edges in common
+    /// with it. The offset and how far apart the tries were; `None` if none stands out.
+    fn scan(&self, step_s: f64) -> Option<(f64, f64)> {
+        let driven_s = self.driven.t_s.first().copied()?;
+        let span_s = self.driven.span_s();
+        let apart_s = (step_s / 20.0)
+            .max(self.driven.step_s())
+            .max((span_s + self.span_s) / 20_000.0);
+        let rows = self.sensed.t_s.len();
+        if rows > 2000 {
+            // That many readings have edges.
+            return None;
+        }
+        let (mut best, mut best_s) = (0.0_f64, 0.0);
+        for window_s in [0.1, 0.25, 0.5, 1.0].map(|share| share * step_s) {
+            let smooth = self.smooth(Shape::Average, window_s);
+            let first_s = driven_s - self.start_s - (1.0 - LEAST_OVERLAP) * self.span_s;
+            let tries = ((span_s + (1.0 - 2.0 * LEAST_OVERLAP) * self.span_s) / apart_s)
+                .ceil()
+                .max(0.0) as usize;
+            for index in 0..=tries {
+                let offset_s = first_s + index as f64 * apart_s;
+                let sums = self.sums(&smooth, offset_s, 0.0, self.all());
+                if sums.count < LEAST_OVERLAP * rows as f64 {
+                    continue;
+                }
+                // Among equals (a periodic load) the one that most readings take part in.
+                let score = sums.correlation() * (sums.count / rows as f64).sqrt();
+                if score.abs() > best.abs() {
+                    (best, best_s) = (score, offset_s);
+                }
+            }
+        }
+        (best.abs() > SCAN_CORRELATION).then_some((best_s, apart_s))
+    }
+
+    /// Offset at the start and drift from the best offsets of several blocks.
+    fn blocks(
+        &self,
+        smooth: &[f64],
+        offset_s: f64,
+        grid_s: f64,
+        step_s: f64,
+    ) -> Option<(f64, f64)> {
+        let rows = self.sensed.t_s.len();
+        let reach_s = 3.0 * grid_s + FASTEST_RATE * self.span_s + step_s;
+        let tries = ((4.0 * reach_s / step_s).ceil() as usize).clamp(50, 600);
+        let mut found: Vec<(f64, f64)> = Vec::new();
+        for block in 0..BLOCKS {
+            let own = rows * block / BLOCKS..rows * (block + 1) / BLOCKS;
+            if own.len() < 20 {
+                return None;
+            }
+            let middle_s =
+                0.5 * (self.sensed.t_s[own.start] + self.sensed.t_s[own.end - 1]) - self.start_s;
+            let mut best = (0.0_f64, 0.0_f64);
+            for index in 0..=tries {
+                let shift_s = reach_s * (2.0 * index as f64 / tries as f64 - 1.0);
+                let sums = self.sums(smooth, offset_s + shift_s, 0.0, own.clone());
+                if sums.count * 2.0 < own.len() as f64 {
+                    continue;
+                }
+                let together = sums.correlation().abs();
+                if together > best.0 {
+                    best = (together, shift_s);
+                }
+            }
+            if best.0 > 0.7 {
+                found.push((middle_s, best.1));
+            }
+        }
+        if found.len() < 2 {
+            return None;
+        }
+        // Median of the slopes of all pairs: one block that went astray does not matter.
+        let mut slopes = Vec::new();
+        for (index, one) in found.iter().enumerate() {
+            slopes.extend(
+                found[index + 1..]
+                    .iter()
+                    .map(|other| (other.1 - one.1) / (other.0 - one.0)),
+            );
+        }
+        slopes.sort_by(f64::total_cmp);
+        let slope = slopes[slopes.len() / 2].clamp(-FASTEST_RATE, FASTEST_RATE);
+        let mut starts: Vec<f64> = found
+            .iter()
+            .map(|(at_s, shift_s)| shift_s - slope * at_s)
+            .collect();
+        starts.sort_by(f64::total_cmp);
+        Some((offset_s + starts[starts.len() / 2], slope * self.span_s))
+    }
+
+    /// Nelder and Mead's simplex over offset, drift and smoothing.
+    fn descend(&self, start: Trial, step_s: f64) -> Trial {
+        let at = |point: [f64; 3]| {
+            let smoothing_s = point[2].abs();
+            if smoothing_s > 0.3 * self.span_s
+                || point[1].abs() > 2.0 * FASTEST_RATE * self.span_s + step_s
+            {
+                return f64::INFINITY;
+            }
+            let smooth = self.smooth(start.shape, smoothing_s);
+            // Offset is that of the middle, so that it does not depend on the drift.
+            self.cost(&smooth, point[0] - 0.5 * point[1], point[1])
+        };
+        let origin = [
+            start.offset_s + 0.5 * start.drift_s,
+            start.drift_s,
+            start.smoothing_s,
+        ];
+        let mut best = (origin, at(origin));
+        for scale in [1.0, 0.2] {
+            let size = [
+                step_s * scale,
+                step_s * scale,
+                (0.5 * start.smoothing_s + step_s) * scale,
+            ];
+            best = simplex(&at, best.0, size, 150);
+        }
+        Trial {
+            shape: start.shape,
+            smoothing_s: best.0[2].abs(),
+            offset_s: best.0[0] - 0.5 * best.0[1],
+            drift_s: best.0[1],
+            cost: best.1,
+        }
+    }
+}
+
+/// Lowest point of a function near `origin`.
+fn simplex(
+    cost: &dyn Fn([f64; 3]) -> f64,
+    origin: [f64; 3],
+    size: [f64; 3],
+    evaluations: usize,
+) -> ([f64; 3], f64) {
+    let mut points = vec![(origin, cost(origin))];
+    for axis in 0..3 {
+        let mut point = origin;
+        point[axis] += size[axis];
+        points.push((point, cost(point)));
+    }
+    let along = |from: [f64; 3], to: [f64; 3], share: f64| {
+        [0, 1, 2].map(|axis| from[axis] + (to[axis] - from[axis]) * share)
+    };
+    let mut spent = 4;
+    while spent < evaluations {
+        points.sort_by(|one, other| one.1.total_cmp(&other.1));
+        let worst = points[3];
+        let centre = [0, 1, 2].map(|axis| {
+            points[..3]
+                .iter()
+                .map(|(point, _)| point[axis])
+                .sum::<f64>()
+                / 3.0
+        });
+        let mut tried = along(worst.0, centre, 2.0);
+        let mut value = cost(tried);
+        spent += 1;
+        if value < points[0].1 {
+            let further = along(worst.0, centre, 3.0);
+            let at_further = cost(further);
+            spent += 1;
+            if at_further < value {
+                (tried, value) = (further, at_further);
+            }
+        } else if value >= points[2].1 {
+            let nearer = along(worst.0, centre, if value < worst.1 { 1.5 } else { 0.5 });
+            let at_nearer = cost(nearer);
+            spent += 1;
+            (tried, value) = (nearer, at_nearer);
+        }
+        if value < worst.1 {
+            points[3] = (tried, value);
+        } else {
+            let best = points[0].0;
+            for point in &mut points[1..] {
+                point.0 = along(best, point.0, 0.5);
+                point.1 = cost(point.0);
+                spent += 1;
+            }
+        }
+    }
+    points.sort_by(|one, other| one.1.total_cmp(&other.1));
+    points[0]
+}
+
+/// Sums of a straight line.
+#[derive(Clone, Copy, Debug, Default)]
+struct Sums {
+    count: f64,
+    x: f64,
+    y: f64,
+    xx: f64,
+    xy: f64,
+    yy: f64,
+    /// First pair: numbers near it do not cancel.
+    origin: Option<(f64, f64)>,
+}
+
+impl Sums {
+    fn add(&mut self, x: f64, y: f64) {
+        let (x0, y0) = *self.origin.get_or_insert((x, y));
+        let (x, y) = (x - x0, y - y0);
+        self.count += 1.0;
+        self.x += x;
+        self.y += y;
+        self.xx += x * x;
+        self.xy += x * y;
+        self.yy += y * y;
+    }
+
+    fn moments(&self) -> (f64, f64, f64) {
+        let count = self.count.max(1.0);
+        (
+            self.xx - self.x * self.x / count,
+            self.xy - self.x * self.y / count,
+            self.yy - self.y * self.y / count,
+        )
+    }
+
+    fn correlation(&self) -> f64 {
+        let (xx, xy, yy) = self.moments();
+        if xx > 0.0 && yy > 0.0 {
+            xy / (xx * yy).sqrt()
+        } else {
+            0.0
+        }
+    }
+
+    /// Gain and zero.
+    fn line(&self) -> Option<(f64, f64)> {
+        let (xx, xy, _) = self.moments();
+        let (x0, y0) = self.origin?;
+        if xx <= 0.0 {
+            return None;
+        }
+        let gain = xy / xx;
+        let zero = (self.y - gain * self.x) / self.count + y0 - gain * x0;
+        Some((gain, zero))
+    }
+}

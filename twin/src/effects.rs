@@ -1,0 +1,324 @@
+//! The library of physics that a simulation can leave out: one file for each effect, and the list of them.
+//!
+//! An effect is a change of the simulation by few parameters; at their nominal values it changes nothing. Adding physics
+//! is one new file and one line in [`LIBRARY`]: nothing else knows the effects by name.
+
+mod capacity;
+mod cell_self_heating;
+pub mod chain;
+mod clipping;
+mod clock_skew;
+mod core_hysteresis;
+mod core_saturation;
+mod coulombic_efficiency;
+mod dead_band;
+mod delay;
+mod diffusion;
+mod entropic;
+mod gain;
+mod gain_temperature;
+mod hum;
+mod lag;
+mod moving_average;
+mod ocv_hysteresis;
+mod offset;
+mod offset_temperature;
+mod parasitic_load;
+mod polarisation;
+mod quantisation;
+mod range_handover;
+mod range_mismatch;
+mod resistance_soc;
+mod resistance_temperature;
+mod sampled_window;
+pub mod scene;
+mod sensor_self_heating;
+mod stray_field;
+mod supply_ratiometric;
+
+use crate::problem::{Problem, View};
+use scene::{Scale, Scene};
+
+/// Every effect, in the order of the documentation's table.
+pub static LIBRARY: [&dyn Effect; 32] = [
+    &offset::Offset,
+    &gain::Gain,
+    &offset_temperature::OffsetTemperature,
+    &gain_temperature::GainTemperature,
+    &supply_ratiometric::SupplyRatiometric,
+    &core_hysteresis::CoreHysteresis,
+    &core_saturation::CoreSaturation,
+    &clipping::Clipping,
+    &lag::Lag,
+    &moving_average::MovingAverage,
+    &delay::Delay,
+    &clock_skew::ClockSkew,
+    &hum::Hum,
+    &quantisation::Quantisation,
+    &dead_band::DeadBand,
+    &range_handover::RangeHandover,
+    &range_mismatch::RangeMismatch,
+    &sensor_self_heating::SensorSelfHeating,
+    &stray_field::StrayField,
+    &sampled_window::SampledWindow,
+    &coulombic_efficiency::CoulombicEfficiency,
+    &parasitic_load::ParasiticLoad,
+    &capacity::Capacity,
+    &polarisation::ONE_BRANCH,
+    &polarisation::TWO_BRANCHES,
+    &polarisation::THREE_BRANCHES,
+    &diffusion::Diffusion,
+    &ocv_hysteresis::OcvHysteresis,
+    &resistance_temperature::ResistanceTemperature,
+    &resistance_soc::ResistanceSoc,
+    &cell_self_heating::CellSelfHeating,
+    &entropic::Entropic,
+];
+
+/// How a parameter is searched for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Search {
+    /// The prediction is linear in it, or nearly so, while everything else stays: it is solved for.
+    Linear,
+    /// Smooth and of either sign.
+    Smooth,
+    /// Smooth, positive, of unknown magnitude: its logarithm is searched.
+    Logarithmic,
+    /// The prediction jumps where it changes: it is searched without derivatives.
+    Stepped,
+}
+
+/// A parameter of an effect.
+#[derive(Clone, Copy, Debug)]
+pub struct Parameter {
+    /// Its name in the effects table; the last part is the unit.
+    pub name: &'static str,
+    /// Unit; `A` stands for the view's unit.
+    pub unit: &'static str,
+    /// Value that switches the effect off.
+    pub off: f64,
+    /// How it is searched for.
+    pub search: Search,
+    /// Needed to run the model, and no property of the physics (a phase): it is not reported.
+    pub internal: bool,
+}
+
+impl Parameter {
+    const fn new(name: &'static str, unit: &'static str, off: f64, search: Search) -> Self {
+        Self {
+            name,
+            unit,
+            off,
+            search,
+            internal: false,
+        }
+    }
+
+    const fn internal(name: &'static str, unit: &'static str, off: f64, search: Search) -> Self {
+        Self {
+            name,
+            unit,
+            off,
+            search,
+            internal: true,
+        }
+    }
+}
+
+/// Where in the chain from conductor to reading an effect acts. Effects are applied in this order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Stage {
+    /// What flows in, and beside, the conductor.
+    Conductor,
+    /// The sensor's magnetic core.
+    Core,
+    /// The sensor's sensitivity and zero.
+    Sensor,
+    /// Time stamps: from when a reading is.
+    Clock,
+    /// Filters.
+    Filter,
+    /// The converter: windows and averages.
+    Converter,
+    /// What is done to the reading at its own time stamps.
+    Output,
+    /// Charge that the battery takes and gives.
+    BatteryCharge,
+    /// Temperature of the cell.
+    BatteryTemperature,
+    /// Ohmic resistance.
+    BatteryResistance,
+    /// Voltages beside the ohmic drop.
+    BatteryVoltage,
+}
+
+/// What is said of an effect: the row of the effects table.
+#[derive(Debug)]
+pub struct Card {
+    /// Its id, fixed.
+    pub id: &'static str,
+    /// The physics in plain words.
+    pub statement: &'static str,
+    /// The equation that the code follows.
+    pub equation: &'static str,
+    /// Parameters, in the order in which values are given.
+    pub parameters: &'static [Parameter],
+    /// Where it shows.
+    pub shows: &'static str,
+    /// Ids of effects that a weak recording cannot tell apart from it.
+    pub looks_like: &'static [&'static str],
+    /// The recording that shows this effect and not the others.
+    pub separated_by: &'static str,
+    /// Where it acts.
+    pub stage: Stage,
+}
+
+/// An effect of the library.
+pub trait Effect: Sync {
+    /// What is said of it.
+    fn card(&self) -> &'static Card;
+
+    /// Whether it can show in this problem: the view and the inputs that it needs are there.
+    fn applies(&self, problem: &Problem) -> bool {
+        sensing(problem)
+    }
+
+    /// Lowest and highest value of a parameter that is still physics.
+    fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64);
+
+    /// Points from which it is searched: values for every parameter, those of [`Search::Linear`] at a small step from off.
+    fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>>;
+
+    /// Changes the scene.
+    fn apply(&self, values: &[f64], scene: &mut Scene<'_>);
+
+    /// What follows from the values, in plain words.
+    fn consequences(&self, _values: &[f64], _problem: &Problem) -> Vec<String> {
+        Vec::new()
+    }
+}
+
+/// What is known when starts are looked for: the readings that count, with the simulation so far.
+#[derive(Clone, Copy, Debug)]
+pub struct Clues<'a> {
+    /// Time of each reading in s.
+    pub t_s: &'a [f64],
+    /// The reading.
+    pub observed: &'a [f64],
+    /// The simulation so far.
+    pub predicted: &'a [f64],
+}
+
+/// The effect of an id; of several with the same id (branches of polarisation) the one with `parameters` parameters.
+pub fn find_with(id: &str, parameters: usize) -> Option<&'static dyn Effect> {
+    LIBRARY
+        .iter()
+        .copied()
+        .find(|effect| effect.card().id == id && effect.card().parameters.len() == parameters)
+}
+
+/// The effect of an id; of several, the one with the most parameters.
+pub fn find(id: &str) -> Option<&'static dyn Effect> {
+    LIBRARY
+        .iter()
+        .copied()
+        .filter(|effect| effect.card().id == id)
+        .max_by_key(|effect| effect.card().parameters.len())
+}
+
+/// Ids in the order of the table, each once.
+pub fn ids() -> Vec<&'static str> {
+    let mut ids: Vec<&'static str> = LIBRARY.iter().map(|effect| effect.card().id).collect();
+    ids.dedup();
+    ids
+}
+
+/// A view in which the sensing chain shows.
+fn sensing(problem: &Problem) -> bool {
+    matches!(problem.view, View::Sensor | View::Charge)
+}
+
+/// A view in which charge and state of charge show.
+fn counting(problem: &Problem) -> bool {
+    matches!(problem.view, View::StateOfCharge | View::Voltage)
+}
+
+/// Logarithmically spaced values, both ends included.
+fn spaced(from: f64, to: f64, count: usize) -> Vec<f64> {
+    if !(from > 0.0 && to > from) || count < 2 {
+        return vec![from.max(to)];
+    }
+    let ratio = (to / from).ln() / (count - 1) as f64;
+    (0..count)
+        .map(|k| from * (ratio * k as f64).exp())
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ids_and_parameter_names_are_the_contract() {
+        let table: Vec<(&str, Vec<&str>)> = ids()
+            .into_iter()
+            .map(|id| {
+                let parameters = find(id).map(|effect| effect.card().parameters);
+                let named = parameters
+                    .unwrap_or_default()
+                    .iter()
+                    .filter(|p| !p.internal);
+                let names = named.map(|p| p.name).collect();
+                (id, names)
+            })
+            .collect();
+        let expected: [(&str, &[&str]); 30] = [
+            ("offset", &["offset_a"]),
+            ("gain", &["gain"]),
+            ("offset-temperature", &["tc_a_per_k"]),
+            ("gain-temperature", &["tc_per_k"]),
+            ("supply-ratiometric", &["ratio"]),
+            ("core-hysteresis", &["remanence_a", "coercivity_a"]),
+            ("core-saturation", &["knee_a", "softness"]),
+            ("clipping", &["high_a", "low_a"]),
+            ("lag", &["tau_s"]),
+            ("moving-average", &["window_s"]),
+            ("delay", &["delay_s"]),
+            ("clock-skew", &["skew_ppm"]),
+            ("hum", &["frequency_hz", "amplitude_a"]),
+            ("quantisation", &["step_a"]),
+            ("dead-band", &["threshold_a"]),
+            ("range-handover", &["tau_s"]),
+            ("range-mismatch", &["gain_ratio", "offset_a"]),
+            ("sensor-self-heating", &["tc_per_a2", "tau_s"]),
+            ("stray-field", &["coupling"]),
+            ("sampled-window", &["period_s", "duty"]),
+            ("coulombic-efficiency", &["efficiency"]),
+            ("parasitic-load", &["load_a"]),
+            ("capacity", &["capacity_ah"]),
+            (
+                "polarisation",
+                &["r1_ohm", "tau1_s", "r2_ohm", "tau2_s", "r3_ohm", "tau3_s"],
+            ),
+            ("diffusion", &["r_ohm", "tau_s"]),
+            ("ocv-hysteresis", &["m_v", "gamma"]),
+            ("resistance-temperature", &["b_k"]),
+            ("resistance-soc", &["rise", "knee_soc"]),
+            ("cell-self-heating", &["rth_k_per_w", "tau_s"]),
+            ("entropic", &["v_per_k"]),
+        ];
+        assert_eq!(table.len(), expected.len());
+        for ((id, names), (expected_id, expected_names)) in table.iter().zip(expected) {
+            assert_eq!((*id, names.as_slice()), (expected_id, expected_names));
+        }
+    }
+
+    #[test]
+    fn what_it_looks_like_exists() {
+        for effect in LIBRARY {
+            for other in effect.card().looks_like {
+                assert!(find(other).is_some(), "{}: {other}", effect.card().id);
+            }
+        }
+    }
+}

@@ -1,0 +1,44 @@
+//! Charge that does not come back.
+
+use super::scene::{Scale, Scene};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, counting};
+use crate::problem::Problem;
+
+/// See [`CARD`].
+#[derive(Debug)]
+pub struct CoulombicEfficiency;
+
+static CARD: Card = Card {
+    id: "coulombic-efficiency",
+    statement: "A part of the charge put in does not come back.",
+    equation: "dSoC/dt = −i·η/Q for charge (i < 0), −i/Q for discharge",
+    parameters: &[Parameter::new("efficiency", "1", 1.0, Search::Linear)],
+    shows: "charging only",
+    looks_like: &["offset", "parasitic-load"],
+    separated_by: "several charges and discharges against a rest voltage",
+    stage: Stage::BatteryCharge,
+};
+
+impl Effect for CoulombicEfficiency {
+    fn card(&self) -> &'static Card {
+        &CARD
+    }
+
+    fn applies(&self, problem: &Problem) -> bool {
+        counting(problem) && problem.drive.reference.iter().any(|i| *i < 0.0)
+    }
+
+    fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {
+        (0.5, 1.2)
+    }
+
+    fn starts(&self, _scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        vec![vec![0.99]]
+    }
+
+    fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
+        if let Some(battery) = &mut scene.battery {
+            battery.efficiency = values[0];
+        }
+    }
+}

@@ -1,0 +1,42 @@
+//! Transport delay.
+
+use super::scene::{Scale, Scene};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+
+/// See [`CARD`].
+#[derive(Debug)]
+pub struct Delay;
+
+static CARD: Card = Card {
+    id: "delay",
+    statement: "The reading comes late by a constant time, or its time stamp does.",
+    equation: "y(t) = i(t − delay)",
+    parameters: &[Parameter::new("delay_s", "s", 0.0, Search::Smooth)],
+    shows: "edges",
+    looks_like: &["lag", "clock-skew"],
+    separated_by: "steps of the current early and late in the recording",
+    stage: Stage::Clock,
+};
+
+impl Effect for Delay {
+    fn card(&self) -> &'static Card {
+        &CARD
+    }
+
+    fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
+        let most = (0.05 * scale.span_s).max(20.0 * scale.step_s);
+        (-most, most)
+    }
+
+    fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        let most = (0.04 * scale.span_s).max(10.0 * scale.step_s);
+        spaced(0.3 * scale.step_s, most, 8)
+            .into_iter()
+            .flat_map(|delay| [vec![delay], vec![-delay]])
+            .collect()
+    }
+
+    fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
+        scene.delay_s += values[0];
+    }
+}

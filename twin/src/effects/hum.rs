@@ -1,0 +1,60 @@
+//! A spectral line.
+
+use super::scene::{Scale, Scene};
+use super::{Card, Clues, Effect, Parameter, Search, Stage};
+use crate::spectrum;
+
+/// See [`CARD`].
+#[derive(Debug)]
+pub struct Hum;
+
+static CARD: Card = Card {
+    id: "hum",
+    statement: "A ripple at the mains or inverter frequency is added, perhaps folded down by the sampling rate.",
+    equation: "y = i + amplitude·sin(2π·frequency·t + φ), φ is fitted beside",
+    parameters: &[
+        Parameter::new("frequency_hz", "Hz", 1.0, Search::Smooth),
+        Parameter::new("amplitude_a", "A", 0.0, Search::Linear),
+        Parameter::internal("phase_rad", "rad", 0.0, Search::Smooth),
+    ],
+    shows: "a spectral line",
+    looks_like: &[],
+    separated_by: "a rest: the line stays",
+    stage: Stage::Output,
+};
+
+impl Effect for Hum {
+    fn card(&self) -> &'static Card {
+        &CARD
+    }
+
+    fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64) {
+        match parameter {
+            0 => (0.0, 0.5 / scale.reading_step_s.max(1e-9)),
+            1 => (0.0, scale.full_scale),
+            _ => (-10.0, 10.0),
+        }
+    }
+
+    fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        let residual: Vec<f64> = clues
+            .observed
+            .iter()
+            .zip(clues.predicted)
+            .map(|(y, p)| y - p)
+            .collect();
+        spectrum::lines(clues.t_s, &residual, scale.reading_step_s)
+            .into_iter()
+            .map(|line| vec![line.frequency_hz, line.amplitude, line.phase_rad])
+            .collect()
+    }
+
+    fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
+        let (turns_hz, amplitude, phase) =
+            (values[0] * std::f64::consts::TAU, values[1], values[2]);
+        let t_s = &scene.observed.t_s;
+        for (value, t) in scene.signal.iter_mut().zip(t_s) {
+            *value += amplitude * (turns_hz * t + phase).sin();
+        }
+    }
+}

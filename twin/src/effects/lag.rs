@@ -1,0 +1,43 @@
+//! First-order low-pass.
+
+use super::scene::{Scale, Scene};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+
+/// See [`CARD`].
+#[derive(Debug)]
+pub struct Lag;
+
+static CARD: Card = Card {
+    id: "lag",
+    statement: "The sensing chain has a low-pass that the simulation lacks: the reading follows late and smoothly.",
+    equation: "τ·dy/dt + y = i",
+    parameters: &[Parameter::new("tau_s", "s", 0.0, Search::Logarithmic)],
+    shows: "after steps, in proportion to di/dt",
+    looks_like: &["moving-average", "delay"],
+    separated_by: "steps of the current, sampled faster than tau/5",
+    stage: Stage::Filter,
+};
+
+impl Effect for Lag {
+    fn card(&self) -> &'static Card {
+        &CARD
+    }
+
+    fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
+        (
+            0.02 * scale.step_s.min(scale.reading_step_s),
+            0.5 * scale.span_s,
+        )
+    }
+
+    fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        spaced(0.2 * scale.step_s, 0.1 * scale.span_s, 9)
+            .into_iter()
+            .map(|tau| vec![tau])
+            .collect()
+    }
+
+    fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
+        scene.signal = scene.low_pass(&scene.signal, values[0]);
+    }
+}

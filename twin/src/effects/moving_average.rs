@@ -1,0 +1,50 @@
+//! Boxcar window.
+
+use super::scene::{Scale, Scene, boxcar};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+
+/// See [`CARD`].
+#[derive(Debug)]
+pub struct MovingAverage;
+
+static CARD: Card = Card {
+    id: "moving-average",
+    statement: "The reading is the mean over a window (a sliding average, or the integration time of a converter) that the simulation lacks.",
+    equation: "y(t) = 1/window · ∫ i over the last window_s",
+    parameters: &[Parameter::new("window_s", "s", 0.0, Search::Logarithmic)],
+    shows: "after steps, ends sharply",
+    looks_like: &["lag", "delay"],
+    separated_by: "steps of the current, sampled faster than a fifth of the window",
+    stage: Stage::Converter,
+};
+
+impl Effect for MovingAverage {
+    fn card(&self) -> &'static Card {
+        &CARD
+    }
+
+    fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
+        (
+            0.05 * scale.step_s.min(scale.reading_step_s),
+            0.5 * scale.span_s,
+        )
+    }
+
+    fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        spaced(0.5 * scale.step_s, 0.2 * scale.span_s, 12)
+            .into_iter()
+            .map(|window| vec![window])
+            .collect()
+    }
+
+    fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
+        let held = scene.held();
+        scene.signal = boxcar(
+            &scene.drive.t_s,
+            &scene.drive.segments,
+            &scene.signal,
+            values[0],
+            held,
+        );
+    }
+}

@@ -1,0 +1,71 @@
+//! Hysteresis of the open-circuit voltage.
+
+use super::scene::{Scale, Scene};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+use crate::problem::{Problem, View};
+
+/// See [`CARD`].
+#[derive(Debug)]
+pub struct OcvHysteresis;
+
+static CARD: Card = Card {
+    id: "ocv-hysteresis",
+    statement: "The open-circuit voltage depends on the direction of the last charge throughput.",
+    equation: "v = m·h, dh/dt = −γ·abs(i)/(3600·Q)·(h + sgn i) (Plett 2004)",
+    parameters: &[
+        Parameter::new("m_v", "V", 0.0, Search::Linear),
+        Parameter::new("gamma", "1", 20.0, Search::Logarithmic),
+    ],
+    shows: "between charge and discharge branches, persists at rest",
+    looks_like: &["polarisation", "diffusion"],
+    separated_by: "rests after a discharge and after a charge to the same state of charge",
+    stage: Stage::BatteryVoltage,
+};
+
+impl Effect for OcvHysteresis {
+    fn card(&self) -> &'static Card {
+        &CARD
+    }
+
+    fn applies(&self, problem: &Problem) -> bool {
+        problem.view == View::Voltage
+    }
+
+    fn bounds(&self, parameter: usize, _scale: &Scale) -> (f64, f64) {
+        if parameter == 0 {
+            (-0.5, 0.5)
+        } else {
+            (0.5, 5000.0)
+        }
+    }
+
+    fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        let _ = scale;
+        spaced(3.0, 1000.0, 6)
+            .into_iter()
+            .map(|gamma| vec![0.005, gamma])
+            .collect()
+    }
+
+    fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
+        let (m, gamma) = (values[0], values[1]);
+        let drive = scene.drive;
+        let Some(battery) = &mut scene.battery else {
+            return;
+        };
+        let per_as = gamma / (3600.0 * battery.capacity_ah);
+        for rows in drive.segments.iter().filter(|rows| !rows.is_empty()) {
+            let mut h = 0.0;
+            for row in rows.clone().skip(1) {
+                let i = 0.5 * (scene.signal[row] + scene.signal[row - 1]);
+                if i != 0.0 {
+                    let target = -i.signum();
+                    h = target
+                        + (h - target)
+                            * (-per_as * i.abs() * (drive.t_s[row] - drive.t_s[row - 1])).exp();
+                }
+                battery.added_v[row] += m * h;
+            }
+        }
+    }
+}

@@ -1,0 +1,44 @@
+//! A consumer ahead of the sensor.
+
+use super::scene::{Scale, Scene};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, counting};
+use crate::problem::Problem;
+
+/// See [`CARD`].
+#[derive(Debug)]
+pub struct ParasiticLoad;
+
+static CARD: Card = Card {
+    id: "parasitic-load",
+    statement: "A consumer draws current ahead of the sensor, which does not see it.",
+    equation: "dSoC/dt = −(i + load)/Q",
+    parameters: &[Parameter::new("load_a", "A", 0.0, Search::Linear)],
+    shows: "state of charge falls at rest",
+    looks_like: &["offset", "coulombic-efficiency"],
+    separated_by: "a long rest",
+    stage: Stage::BatteryCharge,
+};
+
+impl Effect for ParasiticLoad {
+    fn card(&self) -> &'static Card {
+        &CARD
+    }
+
+    fn applies(&self, problem: &Problem) -> bool {
+        counting(problem)
+    }
+
+    fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
+        (-0.5 * scale.largest, 0.5 * scale.largest)
+    }
+
+    fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        vec![vec![1e-3 * scale.capacity_ah.max(0.1)]]
+    }
+
+    fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
+        if let Some(battery) = &mut scene.battery {
+            battery.load_a = values[0];
+        }
+    }
+}

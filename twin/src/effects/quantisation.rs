@@ -1,0 +1,126 @@
+//! Coarser steps.
+
+use super::scene::{Scale, Scene};
+use super::{Card, Clues, Effect, Parameter, Search, Stage};
+
+/// See [`CARD`].
+#[derive(Debug)]
+pub struct Quantisation;
+
+static CARD: Card = Card {
+    id: "quantisation",
+    statement: "The reading moves in steps that are coarser than assumed.",
+    equation: "y = step·round(i/step)",
+    parameters: &[Parameter::new("step_a", "A", 0.0, Search::Stepped)],
+    shows: "staircase, bounded error",
+    looks_like: &["dead-band"],
+    separated_by: "a slow ramp of the current",
+    stage: Stage::Output,
+};
+
+impl Effect for Quantisation {
+    fn card(&self) -> &'static Card {
+        &CARD
+    }
+
+    fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
+        (0.0, 0.5 * scale.full_scale)
+    }
+
+    fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        // Readings on a grid betray their step; noise behind the staircase hides the grid, so a search over steps follows.
+        let mut starts: Vec<Vec<f64>> = lattice(clues.observed)
+            .into_iter()
+            .filter(|step| *step > 1.5 * scale.quantum)
+            .map(|step| vec![step])
+            .collect();
+        starts.extend(by_correlation(clues, scale).map(|step| vec![step]));
+        starts
+    }
+
+    fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
+        let step = values[0];
+        if step > 0.0 {
+            scene
+                .signal
+                .iter_mut()
+                .for_each(|value| *value = step * (*value / step).round());
+        }
+    }
+}
+
+/// Readings that are looked at.
+const ENOUGH: usize = 4000;
+
+/// Steps of a grid on which nearly all readings lie; usually one or none.
+fn lattice(observed: &[f64]) -> Vec<f64> {
+    let mut sorted: Vec<f64> = observed
+        .iter()
+        .copied()
+        .filter(|value| value.is_finite())
+        .collect();
+    sorted.sort_unstable_by(f64::total_cmp);
+    sorted.dedup();
+    // A grid repeats values, and two readings on it differ by its step or a multiple.
+    if sorted.len() < 4 || sorted.len() * 3 > observed.len() {
+        return Vec::new();
+    }
+    let mut gaps: Vec<f64> = sorted.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    gaps.sort_unstable_by(f64::total_cmp);
+    let least = gaps[gaps.len() / 20];
+    let span = sorted[sorted.len() - 1] - sorted[0];
+    let concentration = |step: f64| {
+        let (mut cosine, mut sine) = (0.0, 0.0);
+        for value in &sorted {
+            let turns = value / step * std::f64::consts::TAU;
+            cosine += turns.cos();
+            sine += turns.sin();
+        }
+        f64::hypot(cosine, sine) / sorted.len() as f64
+    };
+    // The gap is known to rounding only: over the span the grid has to stay in step.
+    let fine = 0.1 * least / span.max(least);
+    let best = (-200..=200)
+        .map(|k| least * (1.0 + f64::from(k) * fine))
+        .max_by(|a, b| concentration(*a).total_cmp(&concentration(*b)));
+    best.filter(|step| concentration(*step) > 0.95)
+        .into_iter()
+        .collect()
+}
+
+/// The step whose staircase goes best with the residual.
+fn by_correlation(clues: &Clues<'_>, scale: &Scale) -> Option<f64> {
+    let stride = clues.observed.len().div_ceil(ENOUGH).max(1);
+    let pairs: Vec<(f64, f64)> = clues
+        .observed
+        .iter()
+        .zip(clues.predicted)
+        .step_by(stride)
+        .map(|(y, p)| (y - p, *p))
+        .filter(|(residual, p)| residual.is_finite() && p.is_finite())
+        .collect();
+    let energy: f64 = pairs.iter().map(|(residual, _)| residual * residual).sum();
+    let rms = (energy / pairs.len().max(1) as f64).sqrt();
+    // A staircase of step s has an error of s/√12 rms: the step is no larger than this.
+    let largest = 1.3 * rms * 12f64.sqrt();
+    let smallest = (0.15 * largest).max(1.5 * scale.quantum);
+    if !(smallest > 0.0 && largest > smallest && scale.largest > 0.0) {
+        return None;
+    }
+    let mut best = (0.0, None);
+    let mut step = smallest;
+    while step < largest {
+        let (mut along, mut size) = (0.0, 0.0);
+        for (residual, p) in &pairs {
+            let stair = step * (p / step).round() - p;
+            along += residual * stair;
+            size += stair * stair;
+        }
+        if size > 0.0 && along / size.sqrt() > best.0 {
+            best = (along / size.sqrt(), Some(step));
+        }
+        // A quarter of a step at the far end.
+        step *= 1.0 + (0.25 * step / scale.largest).clamp(2e-4, 0.02);
+    }
+    best.1
+}

@@ -1,0 +1,53 @@
+//! The sensor warms itself.
+
+use super::scene::{Scale, Scene};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+
+/// See [`CARD`].
+#[derive(Debug)]
+pub struct SensorSelfHeating;
+
+static CARD: Card = Card {
+    id: "sensor-self-heating",
+    statement: "The sensor warms with the square of the current, and its sensitivity follows.",
+    equation: "y = i·(1 + tc·LP(i²)), LP: first order with τ",
+    parameters: &[
+        Parameter::new("tc_per_a2", "1/A²", 0.0, Search::Linear),
+        Parameter::new("tau_s", "s", 60.0, Search::Logarithmic),
+    ],
+    shows: "slow, after load",
+    looks_like: &["gain-temperature", "gain"],
+    separated_by: "a long large current after a long rest",
+    stage: Stage::Sensor,
+};
+
+impl Effect for SensorSelfHeating {
+    fn card(&self) -> &'static Card {
+        &CARD
+    }
+
+    fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64) {
+        if parameter == 0 {
+            let most = 0.5 / (scale.rms * scale.rms).max(1e-12);
+            (-most, most)
+        } else {
+            (2.0 * scale.step_s, 2.0 * scale.span_s)
+        }
+    }
+
+    fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        let small = 0.01 / (scale.rms * scale.rms).max(1e-12);
+        spaced(5.0 * scale.step_s, 0.5 * scale.span_s, 6)
+            .into_iter()
+            .map(|tau| vec![small, tau])
+            .collect()
+    }
+
+    fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
+        let squares: Vec<f64> = scene.signal.iter().map(|value| value * value).collect();
+        let heat = scene.low_pass(&squares, values[1]);
+        for (value, heat) in scene.signal.iter_mut().zip(heat) {
+            *value *= 1.0 + values[0] * heat;
+        }
+    }
+}

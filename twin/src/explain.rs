@@ -1,0 +1,592 @@
+//! From problems to named effects: fit, select, say where, how sure and what is left.
+//!
+//! One way: [`workbench`] makes a problem ready, [`screen`] asks which effects could account for what is left, [`fit`] fits
+//! them, [`select`] decides, [`intervals`] and [`locate`] say how sure and where, and this module puts the report together.
+//! Nothing here knows a file or an effect by name.
+
+pub mod fit;
+pub mod flexible;
+pub mod intervals;
+pub mod locate;
+pub mod screen;
+pub mod select;
+pub mod workbench;
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use crate::effects::chain::{Chain, Nuisance};
+use crate::effects::{Effect, find, find_with};
+use crate::problem::Problem;
+use crate::report::data::{
+    EffectReport, FittedModel, HoldoutReport, Inputs, Location, ParameterReport, Report,
+    SignalPlots, SignalReport, Unexplained, Verdict,
+};
+use crate::spectrum;
+use fit::Fit;
+use flexible::{Explainable, Features};
+use select::{Selection, percent};
+use workbench::{Member, Model, Workbench};
+
+/// Structure left beside the named effects makes the explanation a partial one from this share of the residual on.
+const LEFT: f64 = 0.1;
+/// From this ratio of what is left explainable to what the named effects explain on, their names are not to be trusted: another
+/// physics of the same shape would leave as much.
+const DOUBTFUL: f64 = 0.12;
+/// An effect that makes the error in another file larger by this factor is not that file's physics.
+const WORSE: f64 = 1.05;
+/// Folds for the figures of held-out blocks, each with a fit of its own.
+const FOLDS: usize = 5;
+
+/// How to explain.
+#[derive(Clone, Debug, Default)]
+pub struct Options {
+    /// Effects taken out of the library, by id.
+    pub without: Vec<String>,
+    /// Seed of whatever is random.
+    pub seed: u64,
+}
+
+/// A file that is never fitted, with the problems that it makes under the same model file.
+#[derive(Clone, Debug)]
+pub struct Holdout {
+    /// The file.
+    pub file: PathBuf,
+    /// Its problems; matched to the fitted ones by name.
+    pub problems: Vec<Problem>,
+}
+
+/// What one signal's explanation adds to the report.
+struct Part {
+    verdict: Verdict,
+    sentence: String,
+    selection: Selection,
+}
+
+/// Everything about the mismatch. `progress` is told a share, 0 … 1, and what is being done.
+pub fn explain(
+    problems: &[Problem],
+    holdouts: &[Holdout],
+    options: &Options,
+    progress: &mut dyn FnMut(f64, &str),
+) -> Report {
+    let started = Instant::now();
+    let mut report = Report {
+        schema: 1,
+        verdict: Verdict::NoMismatch,
+        summary: String::new(),
+        signals: Vec::new(),
+        locations: Vec::new(),
+        effects: Vec::new(),
+        holdouts: Vec::new(),
+        unexplained: Vec::new(),
+        decisions: Vec::new(),
+        remarks: Vec::new(),
+        seconds: 0.0,
+        seed: options.seed,
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        inputs: Inputs::default(),
+        plots: Vec::new(),
+        models: Vec::new(),
+    };
+    let mut parts = Vec::new();
+    for (index, problem) in problems.iter().enumerate() {
+        let share = 1.0 / problems.len() as f64;
+        let mut told = |part: f64, what: &str| {
+            progress(
+                (index as f64 + part) * share,
+                &format!("{}: {what}", problem.name),
+            );
+        };
+        let part = one(problem, holdouts, options, &mut report, &mut told);
+        parts.push(part);
+    }
+    report.verdict = overall(&parts);
+    report.summary = parts
+        .iter()
+        .map(|part| part.sentence.as_str())
+        .collect::<Vec<_>>()
+        .join(" ");
+    for (part, problem) in parts.iter().zip(problems) {
+        let prefix = |text: &String| format!("{}: {text}", problem.name);
+        report
+            .decisions
+            .extend(part.selection.decisions.iter().map(prefix));
+        report.decisions.extend(
+            part.selection
+                .refused
+                .iter()
+                .map(|text| format!("{}: not named: {text}.", problem.name)),
+        );
+    }
+    report.seconds = started.elapsed().as_secs_f64();
+    progress(1.0, "done");
+    report
+}
+
+/// Of several signals' verdicts.
+fn overall(parts: &[Part]) -> Verdict {
+    let any = |verdict: Verdict| parts.iter().any(|part| part.verdict == verdict);
+    let explained =
+        any(Verdict::Explained) || any(Verdict::PartlyExplained) || any(Verdict::Ambiguous);
+    if any(Verdict::Ambiguous) {
+        Verdict::Ambiguous
+    } else if any(Verdict::PartlyExplained) || (any(Verdict::Unknown) && explained) {
+        Verdict::PartlyExplained
+    } else if any(Verdict::Unknown) {
+        Verdict::Unknown
+    } else if any(Verdict::Explained) {
+        Verdict::Explained
+    } else {
+        Verdict::NoMismatch
+    }
+}
+
+fn rms(values: impl Iterator<Item = f64>) -> f64 {
+    let (mut sum, mut count) = (0.0, 0usize);
+    for value in values.filter(|value| value.is_finite()) {
+        sum += value * value;
+        count += 1;
+    }
+    if count > 0 {
+        (sum / count as f64).sqrt()
+    } else {
+        0.0
+    }
+}
+
+fn one(
+    problem: &Problem,
+    holdouts: &[Holdout],
+    options: &Options,
+    report: &mut Report,
+    progress: &mut dyn FnMut(f64, &str),
+) -> Part {
+    let bench = Workbench::new(problem, &options.without);
+    let mut selection = select::select(&bench, options.seed, progress);
+    progress(0.95, "looking at what is left");
+    let features = Features::new(&bench);
+    let before = features.explain(&selection.plain.residual, options.seed);
+    let left = features.explain(&selection.fit.residual, options.seed);
+    veto(&bench, &mut selection, problem, holdouts);
+    let verdict = judge(&bench, &mut selection, before, left);
+    let model = &selection.fit.model;
+
+    let plain_residual = bench.residual(&bench.plain);
+    let (held_before, held_after, held_residual) = folds(&bench, &selection.fit);
+    let noise = if problem.noise > 0.0 {
+        problem.noise
+    } else {
+        fit::spread(&jumps(&selection.fit.residual)) / std::f64::consts::SQRT_2
+    };
+    report.signals.push(SignalReport {
+        name: problem.name.clone(),
+        unit: problem.unit.clone(),
+        noise_floor: noise,
+        rmse_before: rms(plain_residual.iter().copied()),
+        rmse_after: rms(selection.fit.residual.iter().copied()),
+        held_out_blocks_before: held_before,
+        held_out_blocks_after: held_after,
+        samples: bench.len(),
+    });
+    let mut locations = if verdict == Verdict::NoMismatch {
+        Vec::new()
+    } else {
+        locate::locate(&bench, &plain_residual, options.seed)
+    };
+    attribute(&bench, &selection.fit, &mut locations);
+    report.locations.extend(locations);
+    report
+        .effects
+        .extend(effects(&bench, &selection, options.seed));
+    for holdout in holdouts {
+        for other in holdout
+            .problems
+            .iter()
+            .filter(|other| other.name == problem.name)
+        {
+            report.holdouts.push(held_out_file(holdout, other, model));
+        }
+    }
+    if matches!(verdict, Verdict::Unknown | Verdict::PartlyExplained) {
+        let place = locate::locate(&bench, &selection.fit.residual, options.seed)
+            .into_iter()
+            .next();
+        report.unexplained.push(Unexplained {
+            signal: problem.name.clone(),
+            rmse: rms(selection.fit.residual.iter().copied()),
+            explainable_share: left.share,
+            location: place,
+        });
+    }
+    report.models.push(fitted(problem, &selection.fit));
+    report
+        .plots
+        .push(plots(&bench, &selection.fit, &held_residual));
+    let sentence = sentence(&bench, &selection, verdict, left, report);
+    Part {
+        verdict,
+        sentence,
+        selection,
+    }
+}
+
+fn jumps(residual: &[f64]) -> Vec<f64> {
+    residual.windows(2).map(|pair| pair[1] - pair[0]).collect()
+}
+
+/// Takes effects out again that make the prediction of files that were never fitted worse.
+fn veto(bench: &Workbench<'_>, selection: &mut Selection, problem: &Problem, holdouts: &[Holdout]) {
+    let others: Vec<&Problem> = holdouts
+        .iter()
+        .flat_map(|holdout| &holdout.problems)
+        .filter(|other| other.name == problem.name)
+        .collect();
+    if others.is_empty() {
+        return;
+    }
+    let worst = |with: &Model, without: &Model| -> f64 {
+        others
+            .iter()
+            .map(|other| {
+                let bench = Workbench::new(other, &[]);
+                let rmse =
+                    |model: &Model| rms(bench.residual(&bench.run(&elsewhere(model))).into_iter());
+                rmse(with) / rmse(without).max(1e-300)
+            })
+            .fold(0.0, f64::max)
+    };
+    while !selection.named.is_empty() {
+        let found = (0..selection.fit.model.members.len())
+            .map(|index| {
+                let without = fit::fit(bench, &selection.fit.model.without(index), None);
+                let ratio = worst(&selection.fit.model, &without.model);
+                (index, without, ratio)
+            })
+            .max_by(|a, b| a.2.total_cmp(&b.2));
+        let Some((index, without, ratio)) = found.filter(|(_, _, ratio)| *ratio > WORSE) else {
+            return;
+        };
+        selection.refused.push(format!(
+            "{}: fits here, but makes the error in a file that was not fitted {:.2} times as large",
+            selection.fit.model.members[index].id(),
+            ratio
+        ));
+        selection.fit = fit::polish(bench, &without);
+        selection.rename(bench);
+    }
+}
+
+/// The model as it is taken to another file: how a file starts is its own, the physics is not.
+fn elsewhere(model: &Model) -> Model {
+    Model {
+        nuisance: Nuisance {
+            soc_shift: 0.0,
+            ..model.nuisance
+        },
+        ..model.clone()
+    }
+}
+
+/// The verdict on one signal. Where the names are not to be trusted, the effects are taken back.
+fn judge(
+    bench: &Workbench<'_>,
+    selection: &mut Selection,
+    before: Explainable,
+    left: Explainable,
+) -> Verdict {
+    let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
+    if selection.named.is_empty() {
+        return if before.is_real() && before.share > LEFT / 2.0 {
+            selection.decisions.push(format!(
+                "No effect passes, yet a smooth function of the recorded inputs takes {} of the held-out error (placebos up to {}): unknown.",
+                percent(before.share),
+                percent(before.placebo_p99)
+            ));
+            Verdict::Unknown
+        } else {
+            selection.decisions.push(
+                "No effect passes, and no smooth function of the recorded inputs explains more than chance.".into(),
+            );
+            Verdict::NoMismatch
+        };
+    }
+    let _ = bench;
+    let explained = energy(&selection.plain) - energy(&selection.fit);
+    let left_energy = left.share * energy(&selection.fit);
+    if left.is_real() && left.share > LEFT {
+        let ratio = left_energy / explained.max(1e-300);
+        selection.decisions.push(format!(
+            "Structure is left: a smooth function of the recorded inputs would take {} of what remains (placebos up to {}), {} of what the named effects take.",
+            percent(left.share),
+            percent(left.placebo_p99),
+            percent(ratio)
+        ));
+        if ratio > DOUBTFUL {
+            let ids = selection.fit.model.ids().join(", ");
+            selection.refused.push(format!(
+                "{ids}: the best of the library, but so much structure is left that the true physics is likely another"
+            ));
+            selection.fit = selection.plain.clone();
+            selection.named.clear();
+            return Verdict::Unknown;
+        }
+        return Verdict::PartlyExplained;
+    }
+    if selection
+        .named
+        .iter()
+        .any(|named| !named.equivalent.is_empty())
+    {
+        Verdict::Ambiguous
+    } else {
+        Verdict::Explained
+    }
+}
+
+/// Held-out blocks before and after, each fold predicted by a model fitted on the others; and the residuals.
+fn folds(bench: &Workbench<'_>, fit: &Fit) -> (f64, f64, Vec<f64>) {
+    let plain = bench.residual(&bench.plain);
+    let mut residual = vec![f64::NAN; bench.len()];
+    let folds = FOLDS.min(bench.blocks.len());
+    for fold in 0..folds {
+        let mut used = vec![0.0; bench.len()];
+        for (block, rows) in bench.blocks.iter().enumerate() {
+            if block % folds != fold {
+                used[rows.clone()].fill(1.0);
+            }
+        }
+        let other = fit::fit(bench, &fit.model, Some(&used));
+        for (block, rows) in bench.blocks.iter().enumerate() {
+            if block % folds == fold {
+                residual[rows.clone()].copy_from_slice(&other.residual[rows.clone()]);
+            }
+        }
+    }
+    let before = rms((0..bench.len())
+        .filter(|&row| residual[row].is_finite())
+        .map(|row| plain[row]));
+    let after = rms(residual.iter().copied());
+    (before, after, residual)
+}
+
+/// Which effect accounts for each place: the one that changes the reading most there.
+fn attribute(bench: &Workbench<'_>, fit: &Fit, locations: &mut [Location]) {
+    if fit.model.members.is_empty() || locations.is_empty() {
+        return;
+    }
+    let changes: Vec<(&'static str, Vec<f64>)> = (0..fit.model.members.len())
+        .map(|index| {
+            let without = bench.run(&fit.model.without(index));
+            let change = fit
+                .predicted
+                .iter()
+                .zip(without)
+                .map(|(with, without)| with - without)
+                .collect();
+            (fit.model.members[index].id(), change)
+        })
+        .collect();
+    let variables = locate::variables(bench);
+    for location in locations {
+        let here: Vec<usize> = (0..bench.len())
+            .filter(|&row| locate::within(bench, location, &variables, row).unwrap_or(true))
+            .collect();
+        location.effect = changes
+            .iter()
+            .map(|(id, change)| {
+                (
+                    *id,
+                    here.iter()
+                        .map(|&row| change[row].powi(2))
+                        .filter(|c| c.is_finite())
+                        .sum::<f64>(),
+                )
+            })
+            .max_by(|a, b| a.1.total_cmp(&b.1))
+            .map(|(id, _)| id.to_owned());
+    }
+}
+
+/// The unit of a parameter in this problem: `A` in the effects table stands for the view's unit.
+fn unit(problem: &Problem, unit: &str) -> String {
+    match problem.view {
+        crate::problem::View::Sensor if problem.unit != "A" => unit.replace('A', &problem.unit),
+        _ => unit.to_owned(),
+    }
+}
+
+fn effects(bench: &Workbench<'_>, selection: &Selection, seed: u64) -> Vec<EffectReport> {
+    let intervals = intervals::intervals(bench, &selection.fit, seed);
+    selection
+        .named
+        .iter()
+        .map(|named| {
+            let member = &selection.fit.model.members[named.index];
+            let card = member.effect.card();
+            let parameters = card
+                .parameters
+                .iter()
+                .enumerate()
+                .filter(|(_, parameter)| !parameter.internal)
+                .map(|(p, parameter)| ParameterReport {
+                    name: parameter.name.to_owned(),
+                    value: member.values[p],
+                    ci95: intervals[named.index][p],
+                    off: Some(parameter.off).filter(|off| off.is_finite()),
+                    unit: unit(bench.problem, parameter.unit),
+                })
+                .collect();
+            let separated: Vec<&str> = named
+                .equivalent
+                .iter()
+                .filter_map(|id| find(id))
+                .map(|effect| effect.card().separated_by)
+                .chain((!named.equivalent.is_empty()).then_some(card.separated_by))
+                .collect();
+            EffectReport {
+                id: card.id.to_owned(),
+                signal: bench.problem.name.clone(),
+                statement: card.statement.to_owned(),
+                equation: card.equation.to_owned(),
+                parameters,
+                held_out_gain: named.held_out_gain,
+                placebo_p99: named.placebo_p99,
+                equivalent_to: named.equivalent.iter().map(|id| (*id).to_owned()).collect(),
+                separated_by: separated.join("; or "),
+                consequences: member.effect.consequences(&member.values, bench.problem),
+            }
+        })
+        .collect()
+}
+
+fn held_out_file(holdout: &Holdout, other: &Problem, model: &Model) -> HoldoutReport {
+    let bench = Workbench::new(other, &[]);
+    let model = elsewhere(model);
+    HoldoutReport {
+        file: holdout.file.display().to_string(),
+        signal: other.name.clone(),
+        rmse_before: rms(bench.residual(&bench.plain).into_iter()),
+        rmse_after: rms(bench.residual(&bench.run(&model)).into_iter()),
+    }
+}
+
+fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> SignalPlots {
+    let step = bench.scale.reading_step_s;
+    let plain = bench.residual(&bench.plain);
+    let before = spectrum::density(&bench.t_s, &plain, step, 60);
+    let after = spectrum::density(&bench.t_s, &fit.residual, step, 60);
+    SignalPlots {
+        name: bench.problem.name.clone(),
+        unit: bench.problem.unit.clone(),
+        t_s: bench.t_s.clone(),
+        recorded: bench.y.clone(),
+        before: bench.plain.clone(),
+        after: fit.predicted.clone(),
+        reference: bench.reference.clone(),
+        held_out_residual: held_residual.to_vec(),
+        variables: locate::variables(bench)
+            .into_iter()
+            .map(|variable| {
+                (
+                    format!("{} / {}", variable.name, variable.unit),
+                    variable.values,
+                )
+            })
+            .collect(),
+        spectrum: before
+            .iter()
+            .zip(&after)
+            .map(|(before, after)| (0.5 * (before.0 + before.1), before.2, after.2))
+            .collect(),
+    }
+}
+
+fn sentence(
+    bench: &Workbench<'_>,
+    selection: &Selection,
+    verdict: Verdict,
+    left: Explainable,
+    report: &Report,
+) -> String {
+    let name = &bench.problem.name;
+    let ids: Vec<String> = selection
+        .named
+        .iter()
+        .map(|named| {
+            let id = selection.fit.model.members[named.index].id();
+            if named.equivalent.is_empty() {
+                id.to_owned()
+            } else {
+                format!("{id} (or {})", named.equivalent.join(", "))
+            }
+        })
+        .collect();
+    let figures = report.signals.last().map_or(String::new(), |signal| {
+        format!(
+            "held-out error {} → {} {}",
+            short(signal.held_out_blocks_before),
+            short(signal.held_out_blocks_after),
+            signal.unit
+        )
+    });
+    match verdict {
+        Verdict::NoMismatch => format!(
+            "{name}: recording and simulation agree; nothing is left that any effect explains better than chance."
+        ),
+        Verdict::Explained => format!("{name}: explained by {} ({figures}).", ids.join(" and ")),
+        Verdict::PartlyExplained => format!(
+            "{name}: partly explained by {} ({figures}); structure is left, {} of it within reach of the recorded inputs.",
+            ids.join(" and "),
+            percent(left.share)
+        ),
+        Verdict::Ambiguous => format!(
+            "{name}: explained by {} ({figures}); this recording cannot tell them apart.",
+            ids.join(" and ")
+        ),
+        Verdict::Unknown => format!(
+            "{name}: there is a mismatch, and no effect of the library accounts for it ({figures})."
+        ),
+    }
+}
+
+/// Three digits.
+fn short(value: f64) -> String {
+    if value == 0.0 || !value.is_finite() {
+        return format!("{value}");
+    }
+    let digits = 2 - value.abs().log10().floor() as i32;
+    format!("{value:.*}", digits.clamp(0, 12) as usize)
+}
+
+/// What the simulation with `effects` (id and values in the order of the effect's parameters) says at each observed row;
+/// NaN where the drive does not reach. Effects that the problem has already modelled stay in.
+pub fn predict(problem: &Problem, effects: &[(String, Vec<f64>)]) -> Vec<f64> {
+    let members: Vec<(&'static dyn Effect, &[f64])> = effects
+        .iter()
+        .filter_map(|(id, values)| Some((find_with(id, values.len())?, values.as_slice())))
+        .collect();
+    Chain::new(problem).run(&members, Nuisance::default())
+}
+
+fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
+    let values = |member: &Member| {
+        let names = member
+            .effect
+            .card()
+            .parameters
+            .iter()
+            .map(|parameter| parameter.name.to_owned());
+        names.zip(member.values.iter().copied()).collect()
+    };
+    FittedModel {
+        signal: problem.name.clone(),
+        effects: fit
+            .model
+            .members
+            .iter()
+            .map(|member| (member.id().to_owned(), values(member)))
+            .collect(),
+        nuisance: fit.model.nuisance,
+    }
+}

@@ -1,0 +1,656 @@
+//! Robust least squares for the values of a model: Levenberg–Marquardt on Huber's loss, bounds kept, steps searched.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::workbench::{Model, Workbench};
+use crate::effects::Search;
+use crate::problem::Base;
+
+/// Residuals beyond this many standard deviations count by their size, not by its square (Huber).
+pub const TUNING: f64 = 3.0;
+/// Steps of Levenberg–Marquardt in one go.
+const STEPS: usize = 14;
+/// A step that lowers the loss by a smaller share calls for a new slope.
+const SLOW: f64 = 5e-3;
+/// A step with a new slope that lowers the loss by a smaller share is the last.
+const ENOUGH: f64 = 1e-4;
+
+/// A fitted model.
+#[derive(Clone, Debug)]
+pub struct Fit {
+    /// The model.
+    pub model: Model,
+    /// Its simulation at the rows that count.
+    pub predicted: Vec<f64>,
+    /// Reading less simulation.
+    pub residual: Vec<f64>,
+    /// Spread of the residual, for Huber's loss.
+    pub sigma: f64,
+    /// Huber's loss over the rows fitted, in units of sigma².
+    pub cost: f64,
+}
+
+/// Which values are free, as coordinates of either sign and no bounds to speak of.
+#[derive(Clone, Copy, Debug)]
+enum Coordinate {
+    /// Member, parameter, and whether its logarithm is the coordinate.
+    Value(usize, usize, bool),
+    SocShift,
+    Resistance,
+    Alignment,
+}
+
+/// Spread by the median of absolute values, kept from vanishing where most residuals are nothing.
+pub fn spread(residual: &[f64]) -> f64 {
+    let mut sizes: Vec<f64> = residual.iter().map(|r| r.abs()).collect();
+    if sizes.is_empty() {
+        return 1e-12;
+    }
+    let rms = (residual.iter().map(|r| r * r).sum::<f64>() / residual.len() as f64).sqrt();
+    let middle = sizes.len() / 2;
+    let median = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1;
+    (1.4826 * median).max(0.3 * rms).max(1e-12)
+}
+
+/// Huber's loss of a residual in units of sigma.
+pub fn huber(z: f64) -> f64 {
+    let size = z.abs();
+    if size <= TUNING {
+        0.5 * z * z
+    } else {
+        TUNING * (size - 0.5 * TUNING)
+    }
+}
+
+fn weight(z: f64) -> f64 {
+    let size = z.abs();
+    if size <= TUNING { 1.0 } else { TUNING / size }
+}
+
+/// Derivatives of the simulation by each free coordinate, at the rows that count.
+#[derive(Debug)]
+pub struct Slope {
+    coordinates: Vec<Coordinate>,
+    /// A column for each coordinate.
+    pub columns: Vec<Vec<f64>>,
+    /// Penalty for each coordinate, in units of 1/sigma² of the coordinate, from what the model file says of the base.
+    prior: Vec<f64>,
+    at: Vec<f64>,
+}
+
+impl Slope {
+    /// Number of coordinates.
+    pub fn len(&self) -> usize {
+        self.columns.len()
+    }
+
+    /// True if nothing is free.
+    pub fn is_empty(&self) -> bool {
+        self.columns.is_empty()
+    }
+
+    /// The model with coordinates moved; values stay within bounds.
+    pub fn moved(&self, bench: &Workbench<'_>, model: &Model, by: &[f64]) -> Model {
+        let mut model = model.clone();
+        for (coordinate, delta) in self.coordinates.iter().zip(by) {
+            shift(bench, &mut model, *coordinate, *delta);
+        }
+        model
+    }
+
+    /// Value of a member's parameter if its coordinate were moved by `delta`; `None` if it is not free.
+    pub fn value_at(
+        &self,
+        member: usize,
+        parameter: usize,
+        model: &Model,
+        deltas: &[f64],
+    ) -> Option<f64> {
+        self.coordinates
+            .iter()
+            .zip(deltas)
+            .find_map(|(coordinate, delta)| match coordinate {
+                Coordinate::Value(m, p, logarithmic) if (*m, *p) == (member, parameter) => {
+                    let value = model.members[member].values[parameter];
+                    Some(if *logarithmic {
+                        value * delta.exp()
+                    } else {
+                        value + delta
+                    })
+                }
+                _ => None,
+            })
+    }
+
+    /// Carries the slope along a step (Broyden's update): cheaper than a new one, and nearly as good for small steps.
+    fn learn(&mut self, step: &[f64], before: &[f64], after: &[f64], model: &Model) {
+        let scaled: Vec<f64> = self
+            .columns
+            .iter()
+            .map(|column| dot(column, column).sqrt().max(1e-300))
+            .collect();
+        let length: f64 = step
+            .iter()
+            .zip(&scaled)
+            .map(|(s, scale)| (s * scale).powi(2))
+            .sum();
+        if !(length > 0.0) {
+            return;
+        }
+        let mut missing: Vec<f64> = after
+            .iter()
+            .zip(before)
+            .map(|(after, before)| {
+                if (after - before).is_finite() {
+                    after - before
+                } else {
+                    0.0
+                }
+            })
+            .collect();
+        for (column, s) in self.columns.iter().zip(step) {
+            missing
+                .iter_mut()
+                .zip(column)
+                .for_each(|(m, c)| *m -= c * s);
+        }
+        for ((column, s), scale) in self.columns.iter_mut().zip(step).zip(&scaled) {
+            let share = s * scale * scale / length;
+            column
+                .iter_mut()
+                .zip(&missing)
+                .for_each(|(c, m)| *c += share * m);
+        }
+        for (coordinate, at) in self.coordinates.iter().zip(&mut self.at) {
+            *at = match coordinate {
+                Coordinate::SocShift => model.nuisance.soc_shift,
+                Coordinate::Resistance => model.nuisance.resistance,
+                _ => *at,
+            };
+        }
+    }
+
+    /// Penalty of the base's nuisances at this model, and what it adds to the normal equations.
+    fn penalty(&self, normal: &mut DMatrix<f64>, right: &mut DVector<f64>) {
+        for (k, prior) in self.prior.iter().enumerate() {
+            normal[(k, k)] += prior;
+            right[k] -= prior * self.at[k];
+        }
+    }
+}
+
+fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta: f64) {
+    match coordinate {
+        Coordinate::Value(member, parameter, logarithmic) => {
+            let effect = model.members[member].effect;
+            let (low, high) = effect.bounds(parameter, &bench.scale);
+            let value = &mut model.members[member].values[parameter];
+            *value = if logarithmic {
+                *value * delta.clamp(-3.0, 3.0).exp()
+            } else {
+                *value + delta
+            };
+            *value = value.clamp(low.min(high), high.max(low));
+        }
+        Coordinate::SocShift => {
+            model.nuisance.soc_shift = (model.nuisance.soc_shift + delta).clamp(-1.0, 1.0)
+        }
+        Coordinate::Resistance => {
+            model.nuisance.resistance = (model.nuisance.resistance + delta).clamp(-0.9, 5.0);
+        }
+        Coordinate::Alignment => {
+            let most = 0.6 * bench.scale.step_s.max(bench.scale.reading_step_s);
+            model.nuisance.alignment_s = (model.nuisance.alignment_s + delta).clamp(-most, most);
+        }
+    }
+}
+
+/// Free coordinates of a model with the size of a small step, the penalty and where it is.
+fn coordinates(bench: &Workbench<'_>, model: &Model) -> Vec<(Coordinate, f64, f64, f64)> {
+    let mut all = Vec::new();
+    for (m, member) in model.members.iter().enumerate() {
+        for (p, parameter) in member.effect.card().parameters.iter().enumerate() {
+            let value = member.values[p];
+            let (low, high) = member.effect.bounds(p, &bench.scale);
+            let (logarithmic, step) = match parameter.search {
+                Search::Stepped => continue,
+                Search::Logarithmic => (true, 1e-3),
+                Search::Linear => {
+                    let off = if parameter.off.is_finite() {
+                        parameter.off
+                    } else {
+                        0.0
+                    };
+                    (
+                        false,
+                        (1e-3 * (value - off).abs()).max(1e-7 * (high - low).abs()),
+                    )
+                }
+                Search::Smooth => (false, step_of(bench, parameter.name, value, low, high)),
+            };
+            all.push((Coordinate::Value(m, p, logarithmic), step, 0.0, 0.0));
+        }
+    }
+    if let Base::Battery(base) = &bench.problem.base {
+        let inverse = |sigma: f64| 1.0 / (sigma * sigma);
+        if base.initial_soc_sigma > 0.0 && !model.has("soc-start") {
+            all.push((
+                Coordinate::SocShift,
+                1e-5,
+                inverse(base.initial_soc_sigma),
+                model.nuisance.soc_shift,
+            ));
+        }
+        if base.resistance_sigma > 0.0 && bench.problem.view == crate::problem::View::Voltage {
+            all.push((
+                Coordinate::Resistance,
+                1e-4,
+                inverse(base.resistance_sigma),
+                model.nuisance.resistance,
+            ));
+        }
+    }
+    if bench.aligns(model) {
+        all.push((
+            Coordinate::Alignment,
+            0.01 * bench.scale.step_s,
+            0.0,
+            model.nuisance.alignment_s,
+        ));
+    }
+    all
+}
+
+fn step_of(bench: &Workbench<'_>, name: &str, value: f64, low: f64, high: f64) -> f64 {
+    let scale = &bench.scale;
+    match name {
+        "delay_s" | "since_s" => 0.02 * scale.step_s,
+        "skew_ppm" => (0.02 * scale.step_s / scale.span_s.max(1e-9)) * 1e6,
+        "frequency_hz" => 0.01 / scale.span_s.max(1e-9),
+        "phase_rad" => 1e-3,
+        _ => (1e-3 * value.abs()).max(1e-6 * (high - low).abs()),
+    }
+}
+
+/// The slope at a model.
+pub fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
+    let mut slope = Slope {
+        coordinates: Vec::new(),
+        columns: Vec::new(),
+        prior: Vec::new(),
+        at: Vec::new(),
+    };
+    for (coordinate, step, prior, at) in coordinates(bench, model) {
+        let column = |sign: f64| -> Option<Vec<f64>> {
+            let mut moved = model.clone();
+            shift(bench, &mut moved, coordinate, sign * step);
+            let there = bench.run(&moved);
+            let mut any = false;
+            let column: Vec<f64> = there
+                .iter()
+                .zip(predicted)
+                .map(|(there, here)| {
+                    let slope = sign * (there - here) / step;
+                    any |= slope != 0.0;
+                    if slope.is_finite() { slope } else { 0.0 }
+                })
+                .collect();
+            any.then_some(column)
+        };
+        // At a bound the step goes the other way.
+        if let Some(column) = column(1.0).or_else(|| column(-1.0)) {
+            slope.coordinates.push(coordinate);
+            slope.columns.push(column);
+            slope.prior.push(prior);
+            slope.at.push(at);
+        }
+    }
+    slope
+}
+
+/// Normal equations over some rows: JᵀWJ and JᵀWr.
+pub fn normal(
+    columns: &[Vec<f64>],
+    weights: &[f64],
+    residual: &[f64],
+    rows: std::ops::Range<usize>,
+) -> (DMatrix<f64>, DVector<f64>) {
+    let size = columns.len();
+    let mut matrix = DMatrix::zeros(size, size);
+    let mut right = DVector::zeros(size);
+    let mut weighted = vec![0.0; rows.len()];
+    for a in 0..size {
+        let column = &columns[a][rows.clone()];
+        for ((out, value), weight) in weighted.iter_mut().zip(column).zip(&weights[rows.clone()]) {
+            *out = value * weight;
+        }
+        right[a] = dot(&weighted, &residual[rows.clone()]);
+        for b in 0..=a {
+            let sum = dot(&weighted, &columns[b][rows.clone()]);
+            matrix[(a, b)] = sum;
+            matrix[(b, a)] = sum;
+        }
+    }
+    (matrix, right)
+}
+
+/// Sum of products, in lanes.
+pub fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let mut lanes = [0.0f64; 8];
+    let (a_chunks, b_chunks) = (a.chunks_exact(8), b.chunks_exact(8));
+    let rest: f64 = a_chunks
+        .remainder()
+        .iter()
+        .zip(b_chunks.remainder())
+        .map(|(x, y)| x * y)
+        .sum();
+    for (x, y) in a_chunks.zip(b_chunks) {
+        for lane in 0..8 {
+            lanes[lane] += x[lane] * y[lane];
+        }
+    }
+    lanes.iter().sum::<f64>() + rest
+}
+
+/// Solves with a little damping, scaled by the diagonal; zero where nothing is known.
+pub fn solve(matrix: &DMatrix<f64>, right: &DVector<f64>, damping: f64) -> DVector<f64> {
+    let size = right.len();
+    if size == 0 {
+        return DVector::zeros(0);
+    }
+    let scale: Vec<f64> = (0..size)
+        .map(|k| {
+            let d = matrix[(k, k)];
+            if d > 0.0 { d.sqrt() } else { 1.0 }
+        })
+        .collect();
+    let mut scaled = DMatrix::zeros(size, size);
+    for a in 0..size {
+        for b in 0..size {
+            scaled[(a, b)] = matrix[(a, b)] / (scale[a] * scale[b]);
+        }
+        scaled[(a, a)] += damping + 1e-12;
+        if matrix[(a, a)] <= 0.0 {
+            scaled[(a, a)] = 1.0;
+        }
+    }
+    let right = DVector::from_fn(size, |k, _| right[k] / scale[k]);
+    match scaled.cholesky() {
+        Some(factor) => {
+            let solved = factor.solve(&right);
+            DVector::from_fn(size, |k, _| solved[k] / scale[k])
+        }
+        None => DVector::zeros(size),
+    }
+}
+
+/// Huber's loss of the rows in use, and the penalty.
+fn cost(
+    bench: &Workbench<'_>,
+    model: &Model,
+    residual: &[f64],
+    sigma: f64,
+    used: Option<&[f64]>,
+) -> f64 {
+    let loss: f64 = match used {
+        None => residual.iter().map(|r| huber(r / sigma)).sum(),
+        Some(used) => residual
+            .iter()
+            .zip(used)
+            .map(|(r, use_it)| use_it * huber(r / sigma))
+            .sum(),
+    };
+    let penalty: f64 = coordinates(bench, model)
+        .iter()
+        .map(|(_, _, prior, at)| 0.5 * prior * at * at)
+        .sum();
+    loss + penalty
+}
+
+/// Fits every free value from where the model stands. `used` weighs rows (0: left out); sigma is found on the way.
+pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
+    let mut model = model.clone();
+    if !bench.aligns(&model) {
+        model.nuisance.alignment_s = 0.0;
+    }
+    let mut predicted = bench.run(&model);
+    let mut residual = bench.residual(&predicted);
+    let mut sigma = spread(&residual);
+    // The spread falls while the model becomes better: the loss follows in rounds.
+    for _ in 0..3 {
+        let before = sigma;
+        descend(
+            bench,
+            &mut model,
+            &mut predicted,
+            &mut residual,
+            sigma,
+            used,
+        );
+        search_steps(
+            bench,
+            &mut model,
+            &mut predicted,
+            &mut residual,
+            sigma,
+            used,
+        );
+        sigma = spread(&residual);
+        if sigma > 0.9 * before {
+            break;
+        }
+    }
+    let cost = cost(bench, &model, &residual, sigma, used);
+    Fit {
+        model,
+        predicted,
+        residual,
+        sigma,
+        cost,
+    }
+}
+
+/// Fits until nothing moves any more: for the model that is reported.
+pub fn polish(bench: &Workbench<'_>, from: &Fit) -> Fit {
+    let mut best = from.clone();
+    for _ in 0..6 {
+        let next = fit(bench, &best.model, None);
+        let settled = (next.sigma - best.sigma).abs() < 1e-4 * best.sigma
+            && next.cost > best.cost * (1.0 - 1e-4);
+        best = next;
+        if settled {
+            break;
+        }
+    }
+    best
+}
+
+fn descend(
+    bench: &Workbench<'_>,
+    model: &mut Model,
+    predicted: &mut Vec<f64>,
+    residual: &mut Vec<f64>,
+    sigma: f64,
+    used: Option<&[f64]>,
+) {
+    let mut damping = 1e-4;
+    let mut here = cost(bench, model, residual, sigma, used);
+    let mut slope = slope(bench, model, predicted);
+    let mut fresh = true;
+    let mut steps = 0;
+    while steps < STEPS && !slope.is_empty() {
+        steps += 1;
+        let weights: Vec<f64> = residual
+            .iter()
+            .enumerate()
+            .map(|(row, r)| {
+                weight(r / sigma) / (sigma * sigma) * used.map_or(1.0, |used| used[row])
+            })
+            .collect();
+        let (mut matrix, mut right) = normal(&slope.columns, &weights, residual, 0..bench.len());
+        slope.penalty(&mut matrix, &mut right);
+        let mut gain = 0.0;
+        for _ in 0..6 {
+            let step = solve(&matrix, &right, damping);
+            let moved = slope.moved(bench, model, step.as_slice());
+            let there_predicted = bench.run(&moved);
+            let there_residual = bench.residual(&there_predicted);
+            let there = cost(bench, &moved, &there_residual, sigma, used);
+            if there < here {
+                gain = (here - there) / here.max(1e-300);
+                slope.learn(step.as_slice(), predicted, &there_predicted, &moved);
+                (*model, *predicted, *residual) = (moved, there_predicted, there_residual);
+                here = there;
+                damping = (damping * 0.2).max(1e-9);
+                break;
+            }
+            if !fresh {
+                break;
+            }
+            damping = (damping * 8.0).min(1e6);
+        }
+        // A slope that was only carried along may be why the step was small.
+        if gain < SLOW {
+            if fresh && gain < ENOUGH {
+                return;
+            }
+            slope = self::slope(bench, model, predicted);
+            fresh = true;
+        } else {
+            fresh = false;
+        }
+    }
+}
+
+/// Values at which the simulation jumps: tried around where they are, ever closer.
+fn search_steps(
+    bench: &Workbench<'_>,
+    model: &mut Model,
+    predicted: &mut Vec<f64>,
+    residual: &mut Vec<f64>,
+    sigma: f64,
+    used: Option<&[f64]>,
+) {
+    let mut here = cost(bench, model, residual, sigma, used);
+    let mut found = false;
+    for m in 0..model.members.len() {
+        let effect = model.members[m].effect;
+        for (p, _) in effect
+            .card()
+            .parameters
+            .iter()
+            .enumerate()
+            .filter(|(_, parameter)| parameter.search == Search::Stepped)
+        {
+            for share in [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5] {
+                for _ in 0..4 {
+                    let mut better = false;
+                    for sign in [1.0, -1.0] {
+                        let mut moved = model.clone();
+                        let values = &mut moved.members[m].values;
+                        // A phase may be zero: it moves by shares of its period.
+                        values[p] += sign
+                            * share
+                            * if values[p] == 0.0 {
+                                values[0]
+                            } else {
+                                values[p]
+                            };
+                        let (low, high) = effect.bounds(p, &bench.scale);
+                        values[p] = values[p].clamp(low, high);
+                        let there_predicted = bench.run(&moved);
+                        let there_residual = bench.residual(&there_predicted);
+                        let there = cost(bench, &moved, &there_residual, sigma, used);
+                        if there < here {
+                            (*model, *predicted, *residual) =
+                                (moved, there_predicted, there_residual);
+                            here = there;
+                            better = true;
+                            found = true;
+                            break;
+                        }
+                    }
+                    if !better {
+                        break;
+                    }
+                }
+            }
+        }
+    }
+    if found {
+        descend(bench, model, predicted, residual, sigma, used);
+    }
+}
+
+/// A fit seen from its blocks: what each block says about every coordinate, and how well each is predicted by the others.
+#[derive(Debug)]
+pub struct Blocked {
+    /// The slope at the fit.
+    pub slope: Slope,
+    /// Normal matrix of each block.
+    pub matrices: Vec<DMatrix<f64>>,
+    /// Right side of each block.
+    pub rights: Vec<DVector<f64>>,
+}
+
+/// Looks at a fit block by block, with Huber's weights at `sigma`.
+pub fn blocked(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Blocked {
+    let slope = slope(bench, &fit.model, &fit.predicted);
+    let weights: Vec<f64> = fit
+        .residual
+        .iter()
+        .map(|r| weight(r / sigma) / (sigma * sigma))
+        .collect();
+    let (matrices, rights) = bench
+        .blocks
+        .iter()
+        .map(|rows| normal(&slope.columns, &weights, &fit.residual, rows.clone()))
+        .unzip();
+    Blocked {
+        slope,
+        matrices,
+        rights,
+    }
+}
+
+/// Loss of each row of each block under a model whose values come from the other blocks only (one Gauss–Newton step from the whole fit,
+/// exact where the simulation is linear in its values), in units of sigma².
+pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<Vec<f64>> {
+    let blocked = blocked(bench, fit, sigma);
+    let size = blocked.slope.len();
+    let mut total = DMatrix::zeros(size, size);
+    let mut right = DVector::zeros(size);
+    blocked.slope.penalty(&mut total, &mut right);
+    for (matrix, part) in blocked.matrices.iter().zip(&blocked.rights) {
+        total += matrix;
+        right += part;
+    }
+    bench
+        .blocks
+        .iter()
+        .enumerate()
+        .map(|(block, rows)| {
+            let step = if size == 0 {
+                DVector::zeros(0)
+            } else {
+                solve(
+                    &(&total - &blocked.matrices[block]),
+                    &(&right - &blocked.rights[block]),
+                    1e-9,
+                )
+            };
+            rows.clone()
+                .map(|row| {
+                    let moved: f64 = blocked
+                        .slope
+                        .columns
+                        .iter()
+                        .zip(step.iter())
+                        .map(|(column, step)| column[row] * step)
+                        .sum();
+                    huber((fit.residual[row] - moved) / sigma)
+                })
+                .collect()
+        })
+        .collect()
+}

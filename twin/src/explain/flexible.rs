@@ -1,0 +1,243 @@
+//! How much of a residual any smooth function of the recorded inputs could explain: a regression on many features of them, no
+//! physics, scored on held-out blocks against placebos like everything else.
+
+use nalgebra::{DMatrix, DVector};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
+use rayon::prelude::*;
+
+use super::fit::{TUNING, dot, normal, spread};
+use super::screen::{held_out_gain, turned};
+use super::workbench::Workbench;
+use crate::effects::scene::{Cursor, low_pass};
+
+/// Placebo draws.
+const DRAWS: usize = 60;
+/// Rows looked at.
+const MOST_ROWS: usize = 20_000;
+/// Weight of the ridge, as a share of each feature's own energy.
+const RIDGE: f64 = 1e-3;
+
+/// What a function of the inputs could explain.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Explainable {
+    /// Share of the squared residual on held-out blocks, 0 … 1.
+    pub share: f64,
+    /// 99th percentile of placebos' shares.
+    pub placebo_p99: f64,
+}
+
+impl Explainable {
+    /// More than chance.
+    pub fn is_real(&self) -> bool {
+        self.share > self.placebo_p99 && self.share > 0.0
+    }
+}
+
+/// Features of the inputs at the rows that count, made once for a bench.
+#[derive(Debug)]
+pub struct Features {
+    rows: Vec<usize>,
+    blocks: Vec<std::ops::Range<usize>>,
+    columns: Vec<Vec<f64>>,
+    grams: Vec<DMatrix<f64>>,
+}
+
+impl Features {
+    /// Of a bench.
+    pub fn new(bench: &Workbench<'_>) -> Self {
+        let stride = bench.len().div_ceil(MOST_ROWS).max(1);
+        let mut rows = Vec::new();
+        let mut blocks = Vec::new();
+        for block in &bench.blocks {
+            let start = rows.len();
+            rows.extend(block.clone().step_by(stride));
+            blocks.push(start..rows.len());
+        }
+        let mut columns = columns(bench, &rows);
+        for column in &mut columns {
+            let size = (dot(column, column) / column.len().max(1) as f64).sqrt();
+            if size > 0.0 {
+                column.iter_mut().for_each(|value| *value /= size);
+            }
+        }
+        columns.retain(|column| {
+            column.iter().all(|value| value.is_finite()) && column.iter().any(|value| *value != 0.0)
+        });
+        let nothing = vec![0.0; rows.len()];
+        let weights = vec![1.0; rows.len()];
+        let grams = blocks
+            .iter()
+            .map(|range| {
+                let (mut gram, _) = normal(&columns, &weights, &nothing, range.clone());
+                for k in 0..gram.nrows() {
+                    gram[(k, k)] += RIDGE * range.len() as f64;
+                }
+                gram
+            })
+            .collect();
+        Self {
+            rows,
+            blocks,
+            columns,
+            grams,
+        }
+    }
+
+    /// What they could explain of a residual over the bench's rows.
+    pub fn explain(&self, residual: &[f64], seed: u64) -> Explainable {
+        if self.columns.is_empty() || self.rows.len() < 40 {
+            return Explainable::default();
+        }
+        let limit = TUNING * spread(residual);
+        let residual: Vec<f64> = self
+            .rows
+            .iter()
+            .map(|&row| residual[row].clamp(-limit, limit))
+            .collect();
+        let share = |residual: &[f64]| {
+            let rights: Vec<DVector<f64>> = self
+                .blocks
+                .iter()
+                .map(|rows| {
+                    DVector::from_fn(self.columns.len(), |k, _| {
+                        dot(&self.columns[k][rows.clone()], &residual[rows.clone()])
+                    })
+                })
+                .collect();
+            let all: f64 = self
+                .blocks
+                .iter()
+                .map(|rows| dot(&residual[rows.clone()], &residual[rows.clone()]))
+                .sum();
+            held_out_gain(&self.grams, &rights) / all.max(1e-300)
+        };
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let count = residual.len();
+        let least = count / 20;
+        let span = (count - 2 * least).max(1) as u32;
+        let draws: Vec<(usize, bool)> = (0..DRAWS)
+            .map(|_| {
+                (
+                    least + (random.next_u32() % span) as usize,
+                    random.next_u32().is_multiple_of(2),
+                )
+            })
+            .collect();
+        let mut placebos: Vec<f64> = draws
+            .into_par_iter()
+            .map(|(by, reversed)| share(&turned(&residual, by, reversed)))
+            .collect();
+        placebos.sort_unstable_by(f64::total_cmp);
+        Explainable {
+            share: share(&residual).max(0.0),
+            placebo_p99: placebos.last().copied().unwrap_or_default().max(0.0),
+        }
+    }
+}
+
+/// A series on the drive's rows, at the rows of the observation.
+fn at_rows(bench: &Workbench<'_>, rows: &[usize], series: &[f64], earlier_s: f64) -> Vec<f64> {
+    let drive = &bench.problem.drive;
+    let observed = &bench.problem.observed;
+    let mut current: Option<(usize, Cursor<'_>)> = None;
+    rows.iter()
+        .map(|&index| {
+            let row = bench.rows[index];
+            let segment = observed.segment[row];
+            let Some(range) = drive
+                .segments
+                .get(segment)
+                .filter(|range| !range.is_empty())
+            else {
+                return 0.0;
+            };
+            if current.as_ref().is_none_or(|(known, _)| *known != segment) {
+                current = Some((segment, Cursor::new(&drive.t_s, range.clone())));
+            }
+            current.as_mut().map_or(0.0, |(_, cursor)| {
+                cursor.value(series, observed.t_s[row] - earlier_s, false)
+            })
+        })
+        .collect()
+}
+
+fn columns(bench: &Workbench<'_>, rows: &[usize]) -> Vec<Vec<f64>> {
+    let drive = &bench.problem.drive;
+    let scale = &bench.scale;
+    let x = &drive.reference;
+    let here = at_rows(bench, rows, x, 0.0);
+    let top = scale.largest.max(1e-12);
+    let mut columns: Vec<Vec<f64>> = vec![vec![1.0; rows.len()], here.clone()];
+    let mut push = |column: Vec<f64>| columns.push(column);
+    push(here.iter().map(|v| v.abs()).collect());
+    push(here.iter().map(|v| v * v / top).collect());
+    push(here.iter().map(|v| v * v.abs() / top).collect());
+    let mut sorted: Vec<f64> = here.clone();
+    sorted.sort_unstable_by(f64::total_cmp);
+    for share in [0.02, 0.1, 0.25, 0.5, 0.75, 0.9, 0.98] {
+        let knot = sorted[((sorted.len() - 1) as f64 * share) as usize];
+        push(here.iter().map(|v| (v - knot).max(0.0)).collect());
+    }
+    // What came before, on two ladders of times.
+    let mut tau = 0.5 * scale.step_s;
+    while tau < 0.3 * scale.span_s && tau < 4000.0 * scale.step_s {
+        let slow = low_pass(&drive.t_s, &drive.segments, x, tau, false);
+        let slow = at_rows(bench, rows, &slow, 0.0);
+        push(here.iter().zip(&slow).map(|(v, s)| v - s).collect());
+        let squares: Vec<f64> = x.iter().map(|v| v * v / top).collect();
+        let warm = low_pass(&drive.t_s, &drive.segments, &squares, tau, false);
+        let warm = at_rows(bench, rows, &warm, 0.0);
+        push(warm.iter().zip(&here).map(|(w, v)| w * v / top).collect());
+        push(warm);
+        tau *= 3.0;
+    }
+    for steps in [-2.0, -1.0, 1.0, 2.0, 4.0] {
+        let moved = at_rows(bench, rows, x, steps * scale.step_s);
+        push(moved.iter().zip(&here).map(|(m, v)| m - v).collect());
+    }
+    let environment = [
+        &drive.sensor_temperature_c,
+        &drive.supply_v,
+        &drive.aux_a,
+        &drive.range_high,
+        &drive.cell_temperature_c,
+        &drive.ambient_c,
+    ];
+    for series in environment.into_iter().flatten() {
+        let there = at_rows(bench, rows, series, 0.0);
+        let mean = there.iter().sum::<f64>() / there.len().max(1) as f64;
+        let centred: Vec<f64> = there.iter().map(|v| v - mean).collect();
+        let spread = (dot(&centred, &centred) / centred.len().max(1) as f64).sqrt();
+        if !(spread > 1e-9 * mean.abs().max(1.0)) {
+            continue;
+        }
+        push(centred.iter().map(|v| v * v / spread).collect());
+        push(centred.iter().zip(&here).map(|(v, x)| v * x).collect());
+        push(
+            centred
+                .iter()
+                .zip(&here)
+                .map(|(v, x)| v * x.abs())
+                .collect(),
+        );
+        push(centred);
+    }
+    if scale.capacity_ah > 0.0 {
+        let charge = crate::effects::scene::integral(&drive.t_s, &drive.segments, x, false);
+        let charge = at_rows(bench, rows, &charge, 0.0);
+        let least = charge.iter().copied().fold(f64::INFINITY, f64::min);
+        let most = charge.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        if most > least {
+            for power in [1, 2, 3, 4] {
+                let column: Vec<f64> = charge
+                    .iter()
+                    .map(|q| ((q - least) / (most - least)).powi(power))
+                    .collect();
+                push(column.iter().zip(&here).map(|(q, x)| q * x).collect());
+                push(column);
+            }
+        }
+    }
+    columns
+}

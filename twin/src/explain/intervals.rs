@@ -1,0 +1,76 @@
+//! 95 % intervals of a model's values by block bootstrap: blocks of rows are drawn with replacement, so that the colour of the
+//! noise counts; each draw is one Gauss–Newton step from the whole fit.
+
+use nalgebra::{DMatrix, DVector};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
+
+use super::fit::{Fit, blocked, solve};
+use super::workbench::Workbench;
+use crate::effects::Search;
+
+/// Bootstrap draws.
+const DRAWS: usize = 1000;
+
+/// An interval for each parameter of each member; for values that are searched in steps, their resolution.
+pub fn intervals(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> Vec<Vec<[f64; 2]>> {
+    let blocked = blocked(bench, fit, fit.sigma);
+    let blocks = blocked.matrices.len();
+    let size = blocked.slope.len();
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut draws: Vec<DVector<f64>> = Vec::with_capacity(DRAWS);
+    // Blocks drawn are fewer than blocks seen by the values fitted in them.
+    let widen = (blocks as f64 / (blocks as f64 - 1.0).max(1.0)).sqrt() * 1.06;
+    // Where the whole would step to, were it not at its optimum to the last digit, is no spread.
+    let mut matrix = DMatrix::zeros(size, size);
+    let mut right = DVector::zeros(size);
+    for (part, side) in blocked.matrices.iter().zip(&blocked.rights) {
+        matrix += part;
+        right += side;
+    }
+    let whole = solve(&matrix, &right, 1e-9);
+    for _ in 0..DRAWS {
+        let mut matrix = DMatrix::zeros(size, size);
+        let mut right = DVector::zeros(size);
+        for _ in 0..blocks {
+            let block = (random.next_u32() as usize) % blocks.max(1);
+            matrix += &blocked.matrices[block];
+            right += &blocked.rights[block];
+        }
+        draws.push((solve(&matrix, &right, 1e-9) - &whole) * widen);
+    }
+    fit.model
+        .members
+        .iter()
+        .enumerate()
+        .map(|(m, member)| {
+            member
+                .effect
+                .card()
+                .parameters
+                .iter()
+                .enumerate()
+                .map(|(p, parameter)| {
+                    let value = member.values[p];
+                    if parameter.search == Search::Stepped {
+                        // The search ends at steps of 3·10⁻⁴.
+                        return [value * (1.0 - 5e-4), value * (1.0 + 5e-4)];
+                    }
+                    let mut values: Vec<f64> = draws
+                        .iter()
+                        .filter_map(|draw| {
+                            blocked.slope.value_at(m, p, &fit.model, draw.as_slice())
+                        })
+                        .collect();
+                    if values.is_empty() {
+                        return [value, value];
+                    }
+                    values.sort_unstable_by(f64::total_cmp);
+                    let at =
+                        |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
+                    [at(0.025), at(0.975)]
+                })
+                .collect()
+        })
+        .collect()
+}

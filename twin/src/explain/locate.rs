@@ -1,0 +1,381 @@
+//! Where the mismatch sits: the stretch of time, the operating region and the band of frequency that hold more of its energy
+//! than of the samples, each with a p-value from block permutation.
+
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
+
+use super::workbench::Workbench;
+use crate::effects::scene::Cursor;
+use crate::report::data::{Location, LocationKind};
+use crate::spectrum;
+
+/// Permutations.
+const DRAWS: usize = 200;
+/// Quantiles at which a range may begin or end.
+const EDGES: [f64; 11] = [0.0, 0.02, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.98, 1.0];
+/// Stretches of time that are tried: this many of equal length, and runs of them.
+const STRETCHES: usize = 24;
+/// A place is worth a line if its share of energy is above its share of samples by this factor.
+const WORTH: f64 = 1.5;
+/// And if chance makes it no more often than this.
+const CHANCE: f64 = 0.05;
+/// Places that are named of each kind.
+const MOST: usize = 3;
+
+/// An operating variable at the rows that count.
+#[derive(Clone, Debug)]
+pub struct Variable {
+    /// Its name.
+    pub name: &'static str,
+    /// Its unit.
+    pub unit: String,
+    /// Its values.
+    pub values: Vec<f64>,
+}
+
+/// Operating variables that the recording has.
+pub fn variables(bench: &Workbench<'_>) -> Vec<Variable> {
+    let drive = &bench.problem.drive;
+    let unit = if bench.problem.view == crate::problem::View::Sensor {
+        bench.problem.unit.clone()
+    } else {
+        "A".to_owned()
+    };
+    let x = &bench.reference;
+    let mut variables = vec![
+        Variable {
+            name: "abs(i)",
+            unit: unit.clone(),
+            values: x.iter().map(|x| x.abs()).collect(),
+        },
+        Variable {
+            name: "i",
+            unit: unit.clone(),
+            values: x.clone(),
+        },
+    ];
+    let mut rate = vec![0.0; x.len()];
+    for row in 1..x.len() {
+        let h = bench.t_s[row] - bench.t_s[row - 1];
+        if h > 0.0 {
+            rate[row] = ((x[row] - x[row - 1]) / h).abs();
+        }
+    }
+    variables.push(Variable {
+        name: "abs(di/dt)",
+        unit: format!("{unit}/s"),
+        values: rate,
+    });
+    let environment = [
+        ("temp_sensor_c", "°C", &drive.sensor_temperature_c),
+        ("v_supply_v", "V", &drive.supply_v),
+        ("i_aux_a", "A", &drive.aux_a),
+        ("range_high", "1", &drive.range_high),
+        ("temp_cell_c", "°C", &drive.cell_temperature_c),
+        ("temp_ambient_c", "°C", &drive.ambient_c),
+    ];
+    for (name, unit, series) in environment {
+        let Some(series) = series else { continue };
+        variables.push(Variable {
+            name,
+            unit: unit.to_owned(),
+            values: at_rows(bench, series),
+        });
+    }
+    if bench.scale.capacity_ah > 0.0 {
+        let charge =
+            crate::effects::scene::integral(&drive.t_s, &drive.segments, &drive.reference, false);
+        let values = at_rows(bench, &charge).iter().map(|q| q / 3600.0).collect();
+        variables.push(Variable {
+            name: "charge drawn",
+            unit: "Ah".to_owned(),
+            values,
+        });
+    }
+    variables.retain(|variable| {
+        let first = variable.values.first().copied().unwrap_or_default();
+        variable.values.iter().any(|value| *value != first)
+    });
+    variables
+}
+
+fn at_rows(bench: &Workbench<'_>, series: &[f64]) -> Vec<f64> {
+    let drive = &bench.problem.drive;
+    let observed = &bench.problem.observed;
+    if observed.on_drive_rows {
+        return bench.rows.iter().map(|&row| series[row]).collect();
+    }
+    let mut current: Option<(usize, Cursor<'_>)> = None;
+    bench
+        .rows
+        .iter()
+        .map(|&row| {
+            let segment = observed.segment[row];
+            let Some(range) = drive
+                .segments
+                .get(segment)
+                .filter(|range| !range.is_empty())
+            else {
+                return f64::NAN;
+            };
+            if current.as_ref().is_none_or(|(known, _)| *known != segment) {
+                current = Some((segment, Cursor::new(&drive.t_s, range.clone())));
+            }
+            current.as_mut().map_or(f64::NAN, |(_, cursor)| {
+                cursor.value(series, observed.t_s[row], true)
+            })
+        })
+        .collect()
+}
+
+/// The places of a residual's energy, most telling first; at most [`MOST`] of each kind.
+pub fn locate(bench: &Workbench<'_>, residual: &[f64], seed: u64) -> Vec<Location> {
+    let energy: Vec<f64> = residual.iter().map(|r| r * r).collect();
+    let total: f64 = energy.iter().sum();
+    if !(total > 0.0) || residual.len() < 40 {
+        return Vec::new();
+    }
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut locations = Vec::new();
+    let mut regions: Vec<(f64, Location)> = variables(bench)
+        .iter()
+        .filter_map(|variable| region(bench, variable, &energy, total, &mut random))
+        .collect();
+    regions.sort_by(|a, b| b.0.total_cmp(&a.0));
+    locations.extend(regions.into_iter().take(MOST).map(|(_, location)| location));
+    locations.extend(stretch(bench, &energy, total, &mut random));
+    locations.extend(band(bench, residual, &mut random));
+    locations
+}
+
+/// How much a place tells: energy that is there beyond its share.
+fn telling(energy_share: f64, sample_share: f64) -> f64 {
+    if sample_share <= 0.0 || sample_share >= 1.0 {
+        return 0.0;
+    }
+    // Information of the two-way split, in nats.
+    let part = |e: f64, s: f64| if e > 0.0 { e * (e / s).ln() } else { 0.0 };
+    part(energy_share, sample_share) + part(1.0 - energy_share, 1.0 - sample_share)
+}
+
+fn region(
+    bench: &Workbench<'_>,
+    variable: &Variable,
+    energy: &[f64],
+    total: f64,
+    random: &mut ChaCha8Rng,
+) -> Option<(f64, Location)> {
+    let mut order: Vec<usize> = (0..energy.len())
+        .filter(|&row| variable.values[row].is_finite())
+        .collect();
+    if order.len() < 40 {
+        return None;
+    }
+    order.sort_unstable_by(|&a, &b| variable.values[a].total_cmp(&variable.values[b]));
+    let count = order.len();
+    // A range may only end where the value changes.
+    let mut cuts: Vec<usize> = EDGES
+        .iter()
+        .map(|share| {
+            let mut cut = ((count as f64) * share) as usize;
+            while cut > 0
+                && cut < count
+                && variable.values[order[cut]] == variable.values[order[cut - 1]]
+            {
+                cut += 1;
+            }
+            cut
+        })
+        .collect();
+    cuts.dedup();
+    let sums = |shift: usize| -> Vec<f64> {
+        let mut sums = vec![0.0; cuts.len()];
+        for (k, pair) in cuts.windows(2).enumerate() {
+            let part: f64 = order[pair[0]..pair[1]]
+                .iter()
+                .map(|&row| energy[(row + shift) % energy.len()])
+                .sum();
+            sums[k + 1] = sums[k] + part;
+        }
+        sums
+    };
+    let best = |sums: &[f64]| -> (f64, usize, usize) {
+        let mut best = (0.0, 0, 0);
+        for from in 0..cuts.len() {
+            for to in from + 1..cuts.len() {
+                let samples = (cuts[to] - cuts[from]) as f64 / count as f64;
+                let share = (sums[to] - sums[from]) / total;
+                let tells = telling(share, samples);
+                if share > samples && tells > best.0 {
+                    best = (tells, from, to);
+                }
+            }
+        }
+        best
+    };
+    let here = sums(0);
+    let (tells, from, to) = best(&here);
+    if tells == 0.0 {
+        return None;
+    }
+    let above = (0..DRAWS)
+        .filter(|_| {
+            let shift =
+                energy.len() / 20 + (random.next_u32() as usize) % (energy.len() * 9 / 10).max(1);
+            best(&sums(shift)).0 >= tells
+        })
+        .count();
+    let p_value = (above + 1) as f64 / (DRAWS + 1) as f64;
+    let (energy_share, sample_share) = (
+        (here[to] - here[from]) / total,
+        (cuts[to] - cuts[from]) as f64 / count as f64,
+    );
+    (p_value <= CHANCE && energy_share > WORTH.min(1.0 + 0.5 * (1.0 - sample_share)) * sample_share)
+        .then(|| {
+            (
+                tells,
+                Location {
+                    signal: bench.problem.name.clone(),
+                    kind: LocationKind::Region,
+                    variable: variable.name.to_owned(),
+                    unit: variable.unit.clone(),
+                    from: (from > 0).then(|| variable.values[order[cuts[from]]]),
+                    to: (cuts[to] < count).then(|| variable.values[order[cuts[to] - 1]]),
+                    energy_share,
+                    sample_share,
+                    p_value,
+                    effect: None,
+                },
+            )
+        })
+}
+
+fn stretch(
+    bench: &Workbench<'_>,
+    energy: &[f64],
+    total: f64,
+    random: &mut ChaCha8Rng,
+) -> Option<Location> {
+    let count = energy.len();
+    let cut = |k: usize| count * k / STRETCHES;
+    let parts: Vec<f64> = (0..STRETCHES)
+        .map(|k| energy[cut(k)..cut(k + 1)].iter().sum::<f64>() / total)
+        .collect();
+    let best = |parts: &[f64]| {
+        let mut best = (0.0, 0, 0, 0.0);
+        for from in 0..STRETCHES {
+            let mut share = 0.0;
+            for to in from + 1..=STRETCHES {
+                share += parts[to - 1];
+                let samples = (cut(to) - cut(from)) as f64 / count as f64;
+                let tells = telling(share, samples);
+                if share > samples && tells > best.0 {
+                    best = (tells, from, to, share);
+                }
+            }
+        }
+        best
+    };
+    let (tells, from, to, energy_share) = best(&parts);
+    let above = (0..DRAWS)
+        .filter(|_| {
+            let mut mixed = parts.clone();
+            for k in (1..STRETCHES).rev() {
+                mixed.swap(k, (random.next_u32() as usize) % (k + 1));
+            }
+            best(&mixed).0 >= tells
+        })
+        .count();
+    let p_value = (above + 1) as f64 / (DRAWS + 1) as f64;
+    let sample_share = (cut(to) - cut(from)) as f64 / count as f64;
+    (p_value <= CHANCE && energy_share > WORTH.min(1.0 + 0.5 * (1.0 - sample_share)) * sample_share)
+        .then(|| Location {
+            signal: bench.problem.name.clone(),
+            kind: LocationKind::Time,
+            variable: "t_s".into(),
+            unit: "s".into(),
+            from: Some(bench.t_s[cut(from)]),
+            to: Some(bench.t_s[cut(to) - 1]),
+            energy_share,
+            sample_share,
+            p_value,
+            effect: None,
+        })
+}
+
+fn band(bench: &Workbench<'_>, residual: &[f64], random: &mut ChaCha8Rng) -> Option<Location> {
+    let spectrum = |residual: &[f64]| {
+        spectrum::density(&bench.t_s, residual, bench.scale.reading_step_s, 16)
+            .into_iter()
+            .map(|(from, to, density)| (from, to, density * density * (to - from)))
+            .collect::<Vec<_>>()
+    };
+    let here = spectrum(residual);
+    let total: f64 = here.iter().map(|(_, _, energy)| energy).sum();
+    let width = here.last().map(|(_, to, _)| *to)? - here.first().map(|(from, _, _)| *from)?;
+    if !(total > 0.0 && width > 0.0) {
+        return None;
+    }
+    let best = |bands: &[(f64, f64, f64)]| {
+        let total: f64 = bands.iter().map(|(_, _, energy)| energy).sum();
+        let mut best = (0.0, 0, 0, 0.0);
+        for from in 0..bands.len() {
+            let mut share = 0.0;
+            for to in from..bands.len() {
+                share += bands[to].2 / total;
+                let of_width = (bands[to].1 - bands[from].0) / width;
+                let tells = telling(share, of_width.min(1.0));
+                if share > of_width && tells > best.0 {
+                    best = (tells, from, to, share);
+                }
+            }
+        }
+        best
+    };
+    let (tells, from, to, energy_share) = best(&here);
+    // Without order, residuals are white.
+    let mut mixed = residual.to_vec();
+    let draws = 20;
+    let above = (0..draws)
+        .filter(|_| {
+            for k in (1..mixed.len()).rev() {
+                mixed.swap(k, (random.next_u64() % (k as u64 + 1)) as usize);
+            }
+            best(&spectrum(&mixed)).0 >= tells
+        })
+        .count();
+    let p_value = (above + 1) as f64 / f64::from(draws + 1);
+    let sample_share = ((here[to].1 - here[from].0) / width).min(1.0);
+    (p_value <= CHANCE && energy_share > WORTH * sample_share).then(|| Location {
+        signal: bench.problem.name.clone(),
+        kind: LocationKind::Frequency,
+        variable: "frequency_hz".into(),
+        unit: "Hz".into(),
+        from: Some(here[from].0),
+        to: Some(here[to].1),
+        energy_share,
+        sample_share,
+        p_value,
+        effect: None,
+    })
+}
+
+/// Whether a row (an index among those that count) lies in a place; `None` for a band of frequency.
+pub fn within(
+    bench: &Workbench<'_>,
+    location: &Location,
+    variables: &[Variable],
+    row: usize,
+) -> Option<bool> {
+    let value = match location.kind {
+        LocationKind::Time => bench.t_s[row],
+        LocationKind::Region => {
+            variables
+                .iter()
+                .find(|v| v.name == location.variable)?
+                .values[row]
+        }
+        LocationKind::Frequency => return None,
+    };
+    Some(location.from.is_none_or(|from| value >= from) && location.to.is_none_or(|to| value <= to))
+}

@@ -1,0 +1,635 @@
+//! Which effects are named: forward with refit, swap, backward, masked pairs; and which others would have done as well.
+
+use rayon::prelude::*;
+
+use super::fit::{Fit, fit, held_out, huber, polish};
+use super::screen::{DRAWS, Entry, Screening, replaced, screen};
+use super::workbench::{Member, Model, Workbench};
+use crate::effects::{Effect, Search, Stage, find};
+
+/// Effects in one model at most.
+const MOST_EFFECTS: usize = 6;
+/// Candidates that are fitted after screening.
+const FITTED: usize = 8;
+/// First effects of pairs, and second ones of each.
+const FIRSTS: usize = 5;
+/// Starts of each that are fitted.
+const STARTS: usize = 2;
+/// A named effect takes away at least this share of the held-out squared error (2 % of the held-out rms), overall or where it
+/// acts.
+const FLOOR: f64 = 0.04;
+/// Rows where an effect changes the reading by at least this share of its largest change are where it acts.
+const ACTS: f64 = 0.2;
+/// Share of the held-out error from which on a single effect is clear by itself.
+const CLEAR: f64 = 0.97;
+/// Share of what the best single effect leaves that a pair has to take to be preferred.
+const MUCH: f64 = 0.3;
+/// So many others that would do as well make an effect nameless if it is small.
+const VAGUE: usize = 3;
+/// Share of the held-out error below which an effect is small.
+const SMALL: f64 = 0.2;
+/// Stretches over which two models' losses are compared.
+const STRETCHES: usize = 200;
+/// A model is beaten if another's held-out loss is lower by this many standard errors of their paired difference.
+const BEATEN: f64 = 2.0;
+
+/// A named effect and what speaks for it.
+#[derive(Clone, Debug)]
+pub struct Named {
+    /// Its index in the model.
+    pub index: usize,
+    /// Share of the held-out loss that goes when it is added last.
+    pub held_out_gain: f64,
+    /// 99th percentile of placebos for the same step.
+    pub placebo_p99: f64,
+    /// Effects that would have done as well in its place.
+    pub equivalent: Vec<&'static str>,
+}
+
+/// What selection ends with.
+#[derive(Clone, Debug)]
+pub struct Selection {
+    /// The model as designed, with only the base's own uncertainty fitted.
+    pub plain: Fit,
+    /// The chosen model.
+    pub fit: Fit,
+    /// Its effects.
+    pub named: Vec<Named>,
+    /// Ids of `named`.
+    ids: Vec<&'static str>,
+    /// How it was decided.
+    pub decisions: Vec<String>,
+    /// Candidates that could not be accepted though they were the best at their step, and why not.
+    pub refused: Vec<String>,
+}
+
+impl Selection {
+    /// Asks anew what speaks for each effect, after the model was changed.
+    pub fn rename(&mut self, bench: &Workbench<'_>) {
+        let p99: Vec<(&'static str, f64)> = self
+            .named
+            .iter()
+            .zip(&self.ids)
+            .map(|(named, id)| (*id, named.placebo_p99))
+            .collect();
+        let others = swapped(bench, &self.fit);
+        self.named = name(bench, &self.fit, &others, &p99);
+        self.ids = self.fit.model.ids();
+    }
+}
+
+/// Held-out loss of a fit by row, and in all.
+fn losses(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> (Vec<f64>, f64) {
+    let rows = held_out(bench, fit, sigma).concat();
+    let all = rows.iter().sum();
+    (rows, all)
+}
+
+/// Share of the held-out loss that goes from one fit to a better one, in the spread of the first.
+fn share(bench: &Workbench<'_>, before: &Fit, after: &Fit) -> f64 {
+    let (_, from) = losses(bench, before, before.sigma);
+    let (_, to) = losses(bench, after, before.sigma);
+    (from - to) / from.max(1e-300)
+}
+
+/// Selects. `progress` is told a share, 0 … 1, and what is being done.
+pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &str)) -> Selection {
+    let plain = fit(bench, &Model::default(), None);
+    let mut now = plain.clone();
+    let mut decisions = Vec::new();
+    let mut refused = Vec::new();
+    let mut step_p99: Vec<(&'static str, f64)> = Vec::new();
+    let mut rounds = 0;
+    let (now, named) = loop {
+        while now.model.members.len() < MOST_EFFECTS {
+            let done = now.model.members.len() as f64;
+            progress(
+                0.8 * done / (done + 2.0),
+                "trying every effect of the library",
+            );
+            let screening = screen(bench, &now, seed.wrapping_add(done as u64), DRAWS);
+            let single = step(bench, &now, &screening, &mut decisions, &mut refused);
+            // Where two effects hide each other, the best single one can be the wrong one: pairs are tried at the beginning, and
+            // whenever nothing passes alone.
+            let double = if now.model.members.is_empty() || single.is_none() {
+                pair(
+                    bench,
+                    &now,
+                    &screening,
+                    single.as_ref().map(|(fit, _)| fit),
+                    &mut decisions,
+                )
+            } else {
+                None
+            };
+            let Some((better, p99)) = double.or(single) else {
+                break;
+            };
+            for id in better.model.ids() {
+                if !step_p99.iter().any(|(known, _)| *known == id) {
+                    step_p99.push((id, p99));
+                }
+            }
+            now = better;
+        }
+        rounds += 1;
+        progress(
+            0.85,
+            "trying to do without each effect, and with others in its place",
+        );
+        if let Some(leaner) = backward(bench, &now, &step_p99, &mut decisions) {
+            now = leaner;
+        }
+        let others = swapped(bench, &now);
+        match swap(bench, &now, &others, &mut decisions) {
+            // A better model may have room for another effect.
+            Some(better) if rounds < 3 => now = better,
+            _ => {
+                progress(0.92, "asking which other effects would do as well");
+                let now = polish(bench, &now);
+                let named = name(bench, &now, &others, &step_p99);
+                // Small, and as well explained by many others: that is structure, and no name.
+                let Some(vague) = named
+                    .iter()
+                    .find(|one| one.equivalent.len() >= VAGUE && one.held_out_gain < SMALL)
+                else {
+                    break (now, named);
+                };
+                refused.push(format!(
+                    "{}: takes {} of the held-out error, and so would any of {}",
+                    now.model.members[vague.index].id(),
+                    percent(vague.held_out_gain),
+                    vague.equivalent.join(", ")
+                ));
+                let now = fit(bench, &now.model.without(vague.index), None);
+                let others = swapped(bench, &now);
+                let named = name(bench, &now, &others, &step_p99);
+                break (now, named);
+            }
+        }
+    };
+    Selection {
+        plain,
+        ids: now.model.ids(),
+        fit: now,
+        named,
+        decisions,
+        refused,
+    }
+}
+
+/// Fits the most promising entries in place of nothing.
+fn fits(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    entries: &[Entry],
+    most: usize,
+    starts: usize,
+) -> Vec<(Fit, f64)> {
+    let mut chosen: Vec<&Entry> = Vec::new();
+    let mut effects: Vec<(&'static str, usize, usize)> = Vec::new();
+    for entry in entries {
+        let key = (entry.member.id(), entry.member.values.len());
+        match effects.iter().position(|(id, size, _)| (*id, *size) == key) {
+            Some(at) if effects[at].2 < starts => effects[at].2 += 1,
+            None if effects.len() < most => effects.push((key.0, key.1, 1)),
+            _ => continue,
+        }
+        chosen.push(entry);
+    }
+    chosen
+        .into_par_iter()
+        .map(|entry| {
+            let model = replaced(&now.model, entry.member.effect).with(entry.member.clone());
+            (fit(bench, &model, None), entry.gain)
+        })
+        .collect()
+}
+
+/// The best single addition, if it is accepted.
+fn step(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    screening: &Screening,
+    decisions: &mut Vec<String>,
+    refused: &mut Vec<String>,
+) -> Option<(Fit, f64)> {
+    let fits = fits(bench, now, &screening.entries, FITTED, STARTS);
+    let sigma = fits
+        .iter()
+        .map(|(fit, _)| fit.sigma)
+        .fold(now.sigma, f64::min);
+    let mut ranked: Vec<(Fit, f64)> = fits
+        .into_iter()
+        .map(|(fit, _)| {
+            let loss = losses(bench, &fit, sigma).1;
+            (fit, loss)
+        })
+        .collect();
+    ranked.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let (_, before) = losses(bench, now, sigma);
+    for (better, loss) in ranked.into_iter().take(4) {
+        if loss >= before {
+            break;
+        }
+        let index = better.model.members.len() - 1;
+        let id = better.model.members[index].id();
+        let gain = share(bench, now, &better);
+        if only_aligns(bench, now, &better, index) {
+            continue;
+        }
+        if gain <= screening.placebo_p99 {
+            note(
+                refused,
+                format!(
+                    "{id}: takes {} of the held-out error, placebos up to {}",
+                    percent(gain),
+                    percent(screening.placebo_p99)
+                ),
+            );
+            continue;
+        }
+        match obstacle(bench, now, &better, index, gain) {
+            Some(why) => note(refused, format!("{id}: {why}")),
+            None => {
+                decisions.push(format!(
+                    "{id} added: takes {} of the held-out error; the best of {} placebos of the whole library takes {} (99th percentile).",
+                    percent(gain),
+                    DRAWS,
+                    percent(screening.placebo_p99)
+                ));
+                return Some((better, screening.placebo_p99));
+            }
+        }
+    }
+    None
+}
+
+fn note(list: &mut Vec<String>, text: String) {
+    if !list.contains(&text) {
+        list.push(text);
+    }
+}
+
+/// Why an effect at an index cannot be named though it fits: too small to matter, within the reference's accuracy, or at the end
+/// of what is physics.
+fn obstacle(
+    bench: &Workbench<'_>,
+    before: &Fit,
+    after: &Fit,
+    index: usize,
+    gain: f64,
+) -> Option<String> {
+    let member = &after.model.members[index];
+    let card = member.effect.card();
+    let without = bench.run(&after.model.without(index));
+    let change: Vec<f64> = after
+        .predicted
+        .iter()
+        .zip(&without)
+        .map(|(with, without)| {
+            if (with - without).is_finite() {
+                with - without
+            } else {
+                0.0
+            }
+        })
+        .collect();
+    let largest = change.iter().fold(0.0f64, |most, c| most.max(c.abs()));
+    let (mut from, mut to, mut changed, mut accuracy, mut rows) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    for row in 0..change.len() {
+        if change[row].abs() >= ACTS * largest && largest > 0.0 {
+            from += before.residual[row].powi(2);
+            to += after.residual[row].powi(2);
+            changed += change[row].powi(2);
+            let known = bench.problem.accuracy;
+            accuracy += (known.zero + known.gain * bench.plain[row].abs()).powi(2);
+            rows += 1.0;
+        }
+    }
+    if rows == 0.0 {
+        return Some("changes nothing".into());
+    }
+    let there = 1.0 - to / f64::max(from, 1e-300);
+    if gain < FLOOR && there < FLOOR {
+        return Some(format!(
+            "real, but takes only {} of the held-out error ({} where it acts), below the practical floor of {}",
+            percent(gain),
+            percent(there),
+            percent(FLOOR)
+        ));
+    }
+    let noise = to / rows;
+    if card.stage == Stage::Output && changed / rows < noise {
+        return Some("smaller than the noise where it acts".into());
+    }
+    if changed < accuracy {
+        return Some(format!(
+            "its size, {:.3} rms, is within the reference's own accuracy, {:.3}",
+            f64::sqrt(changed / rows),
+            f64::sqrt(accuracy / rows)
+        ));
+    }
+    for (p, parameter) in card
+        .parameters
+        .iter()
+        .enumerate()
+        .filter(|(_, p)| !p.internal)
+    {
+        let (low, high) = member.effect.bounds(p, &bench.scale);
+        let value = member.values[p];
+        let margin = match parameter.search {
+            Search::Logarithmic => value * 0.01,
+            _ => 1e-4 * (high - low),
+        };
+        let end = if value <= low + margin {
+            Some(low)
+        } else if value >= high - margin {
+            Some(high)
+        } else {
+            None
+        };
+        // Clipping on one side leaves the other rail out of reach; a full duty is a window without pause.
+        let allowed = matches!(
+            parameter.name,
+            "high_a" | "low_a" | "duty" | "softness" | "knee_soc"
+        );
+        if let Some(end) = end
+            && end != 0.0
+            && !allowed
+        {
+            return Some(format!(
+                "{} would be at the end of what is physics, {end:.4}",
+                parameter.name
+            ));
+        }
+    }
+    None
+}
+
+/// Two effects that hide each other: neither passes alone, both together do.
+fn pair(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    screening: &Screening,
+    single: Option<&Fit>,
+    decisions: &mut Vec<String>,
+) -> Option<(Fit, f64)> {
+    // What one effect explains so well needs no second one to be found.
+    if single.is_some_and(|single| share(bench, now, single) > CLEAR) {
+        return None;
+    }
+    if now.model.members.len() + 2 > MOST_EFFECTS {
+        return None;
+    }
+    // A masked effect shows once the other is fitted: from each of the best single ones one goes a step further.
+    let firsts = fits(bench, now, &screening.entries, FIRSTS, 1);
+    let fits: Vec<Fit> = firsts
+        .iter()
+        .flat_map(|(first, _)| {
+            let next = screen(bench, first, 0, 0);
+            fits(bench, first, &next.entries, FIRSTS, 1)
+        })
+        .map(|(fit, _)| fit)
+        .collect();
+    let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
+    let best = fits
+        .into_iter()
+        .map(|fit| {
+            let loss = losses(bench, &fit, sigma).1;
+            (fit, loss)
+        })
+        .min_by(|a, b| a.1.total_cmp(&b.1))?
+        .0;
+    let count = best.model.members.len();
+    let gain = share(bench, now, &best);
+    // Two effects may each gain what a placebo gains.
+    let chance = 1.0 - (1.0 - screening.placebo_p99.min(1.0)).powi(2);
+    if gain <= chance || gain < FLOOR {
+        return None;
+    }
+    if single.is_some_and(|single| share(bench, single, &best) < MUCH) {
+        return None;
+    }
+    // Each of the two has to be missed.
+    for index in count - 2..count {
+        let alone = fit(bench, &best.model.without(index), None);
+        let missed = share(bench, &alone, &best);
+        if missed <= screening.placebo_p99
+            || obstacle(bench, &alone, &best, index, missed).is_some()
+        {
+            return None;
+        }
+    }
+    let ids = best.model.ids();
+    decisions.push(format!(
+        "{} and {} added together: both take {} of the held-out error, more than any one alone and than placebos.",
+        ids[count - 2],
+        ids[count - 1],
+        percent(gain)
+    ));
+    Some((best, screening.placebo_p99))
+}
+
+fn p99_of(step_p99: &[(&'static str, f64)], id: &str) -> f64 {
+    step_p99
+        .iter()
+        .find(|(known, _)| *known == id)
+        .map_or(0.0, |(_, p99)| *p99)
+}
+
+/// Leaves out what is no longer missed.
+fn backward(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    step_p99: &[(&'static str, f64)],
+    decisions: &mut Vec<String>,
+) -> Option<Fit> {
+    let mut leaner: Option<Fit> = None;
+    loop {
+        let here = leaner.as_ref().unwrap_or(now);
+        if here.model.members.len() < 2 {
+            return leaner;
+        }
+        let tried: Vec<(usize, Fit, f64)> = (0..here.model.members.len())
+            .into_par_iter()
+            .map(|index| {
+                let without = fit(bench, &here.model.without(index), None);
+                let missed = share(bench, &without, here);
+                (index, without, missed)
+            })
+            .collect();
+        let least = tried.into_iter().min_by(|a, b| a.2.total_cmp(&b.2));
+        match least {
+            Some((index, without, missed))
+                if missed <= p99_of(step_p99, here.model.members[index].id())
+                    || obstacle(bench, &without, here, index, missed).is_some() =>
+            {
+                decisions.push(format!(
+                    "{} taken out again: with the others there, it takes only {} of the held-out error.",
+                    here.model.members[index].id(),
+                    percent(missed)
+                ));
+                leaner = Some(without);
+            }
+            _ => return leaner,
+        }
+    }
+}
+
+/// Effects that may stand in an effect's place: those that it is said to look like, those that are said to look like it, and
+/// the best of a screening of what it explains.
+fn rivals(bench: &Workbench<'_>, without: &Fit, model: &Model, id: &str) -> Vec<Member> {
+    let card = find(id).map(|effect| effect.card());
+    let alike = |effect: &&'static dyn Effect| {
+        let other = effect.card();
+        card.is_some_and(|card| card.looks_like.contains(&other.id))
+            || other.looks_like.contains(&id)
+    };
+    let screening = screen(bench, without, 0, 0);
+    let mut members: Vec<Member> = Vec::new();
+    let mut count: Vec<(&'static str, usize)> = Vec::new();
+    for (rank, entry) in screening.entries.iter().enumerate() {
+        let other = entry.member.effect;
+        if other.card().id == id || model.has(other.card().id) {
+            continue;
+        }
+        let known = count
+            .iter()
+            .position(|(known, _)| *known == other.card().id);
+        let tried = known.map_or(0, |at| count[at].1);
+        let promising = rank < 3 * FITTED && count.len() < 5;
+        if tried >= STARTS || !(alike(&other) || promising || known.is_some()) {
+            continue;
+        }
+        match known {
+            Some(at) => count[at].1 += 1,
+            None => count.push((other.card().id, 1)),
+        }
+        members.push(entry.member.clone());
+    }
+    members
+}
+
+/// Fits every rival in the place of every effect.
+fn swapped(bench: &Workbench<'_>, now: &Fit) -> Vec<(usize, Fit)> {
+    (0..now.model.members.len())
+        .flat_map(|index| {
+            let id = now.model.members[index].id();
+            let without = fit(bench, &now.model.without(index), None);
+            let rivals = rivals(bench, &without, &now.model, id);
+            rivals
+                .into_par_iter()
+                .map(|rival| (index, fit(bench, &without.model.with(rival), None)))
+                .collect::<Vec<_>>()
+        })
+        .collect()
+}
+
+fn swap(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    others: &[(usize, Fit)],
+    decisions: &mut Vec<String>,
+) -> Option<Fit> {
+    let sigma = others
+        .iter()
+        .map(|(_, fit)| fit.sigma)
+        .fold(now.sigma, f64::min);
+    let (_, here) = losses(bench, now, sigma);
+    let (index, best, loss) = others
+        .iter()
+        .map(|(index, fit)| (*index, fit, losses(bench, fit, sigma).1))
+        .min_by(|a, b| a.2.total_cmp(&b.2))?;
+    let last = best.model.members.len() - 1;
+    if loss >= here * (1.0 - 1e-3) {
+        return None;
+    }
+    let without = fit(bench, &best.model.without(last), None);
+    if only_aligns(bench, &without, best, last) || obstacle(bench, now, best, last, 1.0).is_some() {
+        return None;
+    }
+    decisions.push(format!(
+        "{} replaced by {}: the held-out error is lower by {}.",
+        now.model.members[index].id(),
+        best.model.members[last].id(),
+        percent((here - loss) / here)
+    ));
+    Some(best.clone())
+}
+
+/// What speaks for each effect, and what would have done as well.
+fn name(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    others: &[(usize, Fit)],
+    step_p99: &[(&'static str, f64)],
+) -> Vec<Named> {
+    (0..now.model.members.len())
+        .map(|index| {
+            let id = now.model.members[index].id();
+            let without = fit(bench, &now.model.without(index), None);
+            let mut equivalent: Vec<&'static str> = others
+                .iter()
+                .filter(|(at, _)| *at == index)
+                .filter(|(_, other)| {
+                    let last = other.model.members.len() - 1;
+                    !beaten(bench, other, now)
+                        && obstacle(bench, &without, other, last, 1.0).is_none()
+                })
+                .filter_map(|(_, other)| other.model.members.last().map(Member::id))
+                .collect();
+            equivalent.sort_unstable();
+            equivalent.dedup();
+            Named {
+                index,
+                held_out_gain: share(bench, &without, now),
+                placebo_p99: p99_of(step_p99, id),
+                equivalent,
+            }
+        })
+        .collect()
+}
+
+/// Whether a model's held-out loss is higher than the chosen one's by more than chance, stretch against stretch.
+fn beaten(bench: &Workbench<'_>, other: &Fit, chosen: &Fit) -> bool {
+    let sigma = chosen.sigma.min(other.sigma);
+    let (theirs, _) = losses(bench, other, sigma);
+    let (ours, _) = losses(bench, chosen, sigma);
+    let rows = (ours.len() / STRETCHES).max(1);
+    let differences: Vec<f64> = theirs
+        .chunks(rows)
+        .zip(ours.chunks(rows))
+        .map(|(a, b)| a.iter().sum::<f64>() - b.iter().sum::<f64>())
+        .collect();
+    let count = differences.len() as f64;
+    let mean = differences.iter().sum::<f64>() / count;
+    let variance =
+        differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
+    mean > BEATEN * (variance / count).sqrt()
+}
+
+/// Whether a model owes what it gains to the alignment of samples that its effect sets free, and not to the effect.
+fn only_aligns(bench: &Workbench<'_>, before: &Fit, after: &Fit, index: usize) -> bool {
+    if after.model.nuisance.alignment_s == before.model.nuisance.alignment_s {
+        return false;
+    }
+    let aligned = bench.residual(&bench.run(&after.model.without(index)));
+    let loss = |residual: &[f64]| {
+        residual
+            .iter()
+            .map(|r| huber(r / before.sigma))
+            .sum::<f64>()
+    };
+    let (from, to) = (loss(&before.residual), loss(&after.residual));
+    from - loss(&aligned) > 0.5 * (from - to)
+}
+
+/// A share in percent, short.
+pub fn percent(share: f64) -> String {
+    if share.is_finite() {
+        format!("{:.3} %", 100.0 * share).replace(".000 %", " %")
+    } else {
+        "more than any".into()
+    }
+}

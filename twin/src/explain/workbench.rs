@@ -1,0 +1,297 @@
+//! One problem, ready to be fitted: the rows that count, blocks of them, and what sizes are natural.
+
+use std::ops::Range;
+
+use crate::effects::chain::{Chain, Nuisance};
+use crate::effects::scene::Scale;
+use crate::effects::{Clues, Effect, LIBRARY, Stage};
+use crate::problem::{Base, Problem};
+
+/// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row).
+const MOST_ROWS: usize = 250_000;
+/// Blocks that are held out in turn.
+const BLOCKS: usize = 24;
+/// Rows that a block has at least.
+const LEAST_ROWS: usize = 12;
+/// Share of a block that is left out at its end, so that neighbours do not tell each other's noise.
+const GUARD: f64 = 0.08;
+
+/// An effect with values.
+#[derive(Clone)]
+pub struct Member {
+    /// The effect.
+    pub effect: &'static dyn Effect,
+    /// A value for each of its parameters.
+    pub values: Vec<f64>,
+}
+
+impl std::fmt::Debug for Member {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}{:?}", self.id(), self.values)
+    }
+}
+
+impl Member {
+    /// Its effect's id.
+    pub fn id(&self) -> &'static str {
+        self.effect.card().id
+    }
+}
+
+/// A model: effects with values, and what the base may differ by.
+#[derive(Clone, Debug, Default)]
+pub struct Model {
+    /// Effects.
+    pub members: Vec<Member>,
+    /// The base.
+    pub nuisance: Nuisance,
+}
+
+impl Model {
+    /// Whether an effect of this id is in it.
+    pub fn has(&self, id: &str) -> bool {
+        self.members.iter().any(|member| member.id() == id)
+    }
+
+    /// With one more effect.
+    pub fn with(&self, member: Member) -> Self {
+        let mut model = self.clone();
+        model.members.push(member);
+        model
+    }
+
+    /// Without the effect at an index.
+    pub fn without(&self, index: usize) -> Self {
+        let mut model = self.clone();
+        model.members.remove(index);
+        model
+    }
+
+    /// Ids in the order of the library.
+    pub fn ids(&self) -> Vec<&'static str> {
+        self.members.iter().map(Member::id).collect()
+    }
+}
+
+/// See the module.
+#[allow(missing_debug_implementations, reason = "effects are functions")]
+pub struct Workbench<'a> {
+    /// The problem.
+    pub problem: &'a Problem,
+    chain: Chain<'a>,
+    /// Natural sizes.
+    pub scale: Scale,
+    /// Observed rows that fits look at.
+    pub rows: Vec<usize>,
+    /// Their time in s.
+    pub t_s: Vec<f64>,
+    /// Their readings.
+    pub y: Vec<f64>,
+    /// The simulation as designed, at those rows.
+    pub plain: Vec<f64>,
+    /// The reference at those rows (for battery views the current).
+    pub reference: Vec<f64>,
+    /// Ranges of those rows that are held out in turn, guards left out.
+    pub blocks: Vec<Range<usize>>,
+    /// Effects that may be named.
+    pub library: Vec<&'static dyn Effect>,
+}
+
+impl<'a> Workbench<'a> {
+    /// For a problem; `without` takes effects out of the library.
+    pub fn new(problem: &'a Problem, without: &[String]) -> Self {
+        let chain = Chain::new(problem);
+        let all = chain.run(&[], Nuisance::default());
+        let observed = &problem.observed;
+        let valid: Vec<usize> = (0..observed.t_s.len())
+            .filter(|&row| {
+                observed.valid[row] && observed.value[row].is_finite() && all[row].is_finite()
+            })
+            .collect();
+        let stride = valid.len().div_ceil(MOST_ROWS).max(1);
+        let rows: Vec<usize> = valid.iter().copied().step_by(stride).collect();
+        let at = |series: &[f64]| rows.iter().map(|&row| series[row]).collect::<Vec<f64>>();
+        let (t_s, y, plain) = (at(&observed.t_s), at(&observed.value), at(&all));
+        let reference = match &problem.base {
+            Base::Sensor(_) => plain.clone(),
+            // Battery views are read on the drive's rows or between them: the nearest is near enough for regions.
+            Base::Battery(_) => nearest(problem, &rows),
+        };
+        let scale = scale(problem, &t_s, &y, &plain);
+        let blocks = blocks(&rows, problem);
+        let library = LIBRARY
+            .iter()
+            .copied()
+            .filter(|effect| {
+                let id = effect.card().id;
+                effect.applies(problem)
+                    && !without.iter().any(|name| name == id)
+                    && !problem.modelled.iter().any(|(known, _)| *known == id)
+            })
+            .collect();
+        Self {
+            problem,
+            chain,
+            scale,
+            rows,
+            t_s,
+            y,
+            plain,
+            reference,
+            blocks,
+            library,
+        }
+    }
+
+    /// Rows that count.
+    pub fn len(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// True without any.
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
+    /// The simulation at every observed row.
+    pub fn everywhere(&self, model: &Model) -> Vec<f64> {
+        let members: Vec<(&'static dyn Effect, &[f64])> = model
+            .members
+            .iter()
+            .map(|member| (member.effect, member.values.as_slice()))
+            .collect();
+        self.chain.run(&members, model.nuisance)
+    }
+
+    /// The simulation at the rows that count.
+    pub fn run(&self, model: &Model) -> Vec<f64> {
+        let all = self.everywhere(model);
+        self.rows.iter().map(|&row| all[row]).collect()
+    }
+
+    /// Reading less simulation.
+    pub fn residual(&self, predicted: &[f64]) -> Vec<f64> {
+        self.y
+            .iter()
+            .zip(predicted)
+            // Beyond the drive's ends (a delay can reach there) nothing is known.
+            .map(|(y, p)| if p.is_finite() { y - p } else { 0.0 })
+            .collect()
+    }
+
+    /// What starts may look at.
+    pub fn clues<'b>(&'b self, predicted: &'b [f64]) -> Clues<'b> {
+        Clues {
+            t_s: &self.t_s,
+            observed: &self.y,
+            predicted,
+        }
+    }
+
+    /// Whether the sub-step alignment is free in a model: an effect works on what is between the samples.
+    pub fn aligns(&self, model: &Model) -> bool {
+        matches!(self.problem.base, Base::Sensor(_))
+            && !model.has("delay")
+            && model.members.iter().any(|member| {
+                matches!(member.effect.card().stage, Stage::Filter | Stage::Converter)
+            })
+    }
+}
+
+fn nearest(problem: &Problem, rows: &[usize]) -> Vec<f64> {
+    let drive = &problem.drive;
+    let observed = &problem.observed;
+    rows.iter()
+        .map(|&row| {
+            if observed.on_drive_rows {
+                return drive.reference[row];
+            }
+            let Some(range) = drive.segments.get(observed.segment[row]) else {
+                return 0.0;
+            };
+            let times = &drive.t_s[range.clone()];
+            let at = times
+                .partition_point(|t| *t <= observed.t_s[row])
+                .saturating_sub(1);
+            drive
+                .reference
+                .get(range.start + at)
+                .copied()
+                .unwrap_or_default()
+        })
+        .collect()
+}
+
+fn rms(values: impl Iterator<Item = f64>) -> f64 {
+    let (mut sum, mut count) = (0.0, 0.0);
+    for value in values.filter(|value| value.is_finite()) {
+        sum += value * value;
+        count += 1.0;
+    }
+    if count > 0.0 {
+        f64::sqrt(sum / count)
+    } else {
+        0.0
+    }
+}
+
+fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
+    let drive = &problem.drive;
+    let largest = drive
+        .reference
+        .iter()
+        .fold(0.0f64, |most, x| most.max(x.abs()));
+    let mut steps: Vec<f64> = t_s
+        .windows(2)
+        .map(|pair| pair[1] - pair[0])
+        .filter(|step| *step > 0.0)
+        .collect();
+    let middle = steps.len() / 2;
+    let reading_step_s = if steps.is_empty() {
+        drive.median_step_s()
+    } else {
+        *steps.select_nth_unstable_by(middle, f64::total_cmp).1
+    };
+    let span_s = drive
+        .segments
+        .iter()
+        .filter(|rows| !rows.is_empty())
+        .map(|rows| drive.t_s[rows.end - 1] - drive.t_s[rows.start])
+        .fold(0.0, f64::max);
+    let mut scale = Scale {
+        largest,
+        rms: rms(drive.reference.iter().copied()),
+        full_scale: largest.max(y.iter().fold(0.0f64, |most, value| most.max(value.abs()))),
+        mismatch: rms(y.iter().zip(plain).map(|(y, p)| y - p)),
+        step_s: drive.median_step_s(),
+        reading_step_s,
+        span_s,
+        ..Scale::default()
+    };
+    match &problem.base {
+        Base::Sensor(base) => {
+            scale.full_scale = base.full_scale.unwrap_or(scale.full_scale);
+            scale.window_s = base.window_s;
+            scale.quantum = base.step;
+        }
+        Base::Battery(base) => {
+            scale.capacity_ah = base.capacity_ah;
+            scale.resistance_ohm = base.resistance_ohm;
+        }
+    }
+    scale
+}
+
+/// Blocks of equal numbers of rows; none reaches over a change of segment that starts a new operation by more than it must.
+fn blocks(rows: &[usize], problem: &Problem) -> Vec<Range<usize>> {
+    let count = (rows.len() / LEAST_ROWS).clamp(1, BLOCKS);
+    let _ = problem;
+    (0..count)
+        .map(|block| {
+            let start = rows.len() * block / count;
+            let end = rows.len() * (block + 1) / count;
+            let guard = ((end - start) as f64 * GUARD) as usize;
+            start..end - guard
+        })
+        .collect()
+}

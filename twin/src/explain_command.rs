@@ -1,0 +1,233 @@
+//! `twin explain`.
+
+mod calibration;
+
+use std::{
+    fs,
+    io::Write,
+    path::{Path, PathBuf},
+};
+
+use clap::Args;
+use recording::{Error, output::WholeFile};
+
+use crate::{
+    explain::{self, Holdout, Options},
+    failure::Failure,
+    model::{Found, Model, Shift, registry},
+    prepare::{Inputs, Purpose, prepare},
+    progress::Progress,
+    report::{
+        data::{self, Report},
+        html, json, text,
+    },
+};
+
+/// What an example of its use looks like.
+const EXAMPLE: &str = "\
+Example:
+  twin explain --model board.toml --recording drive.csv --holdout other-day.csv --out report
+
+Writes report/report.json, report/report.html (one file, no network) and report/model.toml, the model file with the
+physics that was found; report/calibration.toml where the board can correct it. docs/model-file.md describes the model
+file, `twin effects` lists the physics that is looked for.";
+/// Width of the summary where the terminal does not tell its own.
+const WIDTH: usize = 100;
+
+/// Says where a recording and the simulation disagree, and which physics was left out.
+#[derive(Args, Clone, Debug)]
+#[command(after_help = EXAMPLE)]
+pub struct Arguments {
+    /// What the simulation knows (TOML).
+    #[arg(long, value_name = "FILE")]
+    model: PathBuf,
+    /// The recording, as CSV or Parquet.
+    #[arg(long, value_name = "FILE")]
+    recording: PathBuf,
+    /// The reference, if another instrument logged it on its own clock.
+    #[arg(long, value_name = "FILE")]
+    reference: Option<PathBuf>,
+    /// Another recording, never fitted, on which the result is shown. May be given several times.
+    #[arg(long, value_name = "FILE")]
+    holdout: Vec<PathBuf>,
+    /// Folder for the results.
+    #[arg(long, value_name = "FOLDER")]
+    out: PathBuf,
+    /// Takes an effect out of the library. May be given several times.
+    #[arg(long, value_name = "EFFECT")]
+    without: Vec<String>,
+    /// Seed of whatever is random.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Calls a column by another name; a minus before the column turns its sign.
+    #[arg(long, value_name = "NAME=COLUMN", allow_hyphen_values = true)]
+    map: Vec<String>,
+}
+
+/// Explains, writes the results and returns what fits a screen.
+pub fn run(arguments: &Arguments) -> Result<String, Failure> {
+    for id in &arguments.without {
+        if registry::find(id).is_none() {
+            return Err(Failure::Input(format!(
+                "--without {id}: found no such effect, expected one of {}",
+                registry::ids().join(", ")
+            )));
+        }
+    }
+    let out = &arguments.out;
+    if out.exists() && !out.is_dir() {
+        return Err(Failure::Input(format!(
+            "{}: found a file, expected a folder or a new name",
+            out.display()
+        )));
+    }
+    let model = Model::read(&arguments.model)?;
+    let reading = Progress::new(format!("reading {}", arguments.recording.display()));
+    let inputs = Inputs {
+        recording: arguments.recording.clone(),
+        reference: arguments.reference.clone(),
+        mapping: arguments.map.clone(),
+    };
+    let prepared = prepare(&model, &inputs, Purpose::Compare)?;
+    let mut remarks = prepared.remarks.clone();
+    let mut holdouts = Vec::new();
+    for file in &arguments.holdout {
+        let inputs = Inputs {
+            recording: file.clone(),
+            reference: None,
+            mapping: arguments.map.clone(),
+        };
+        let other = prepare(&model, &inputs, Purpose::Compare)?;
+        remarks.extend(
+            other
+                .remarks
+                .iter()
+                .map(|remark| format!("{}: {remark}", file.display())),
+        );
+        holdouts.push(Holdout {
+            file: file.clone(),
+            problems: other.problems(),
+        });
+    }
+    drop(reading);
+    let problems = prepared.problems();
+    let mut explaining = Progress::new(format!("explaining {}", arguments.recording.display()));
+    let options = Options {
+        without: arguments.without.clone(),
+        seed: arguments.seed,
+    };
+    let mut report = explain::explain(&problems, &holdouts, &options, &mut |share, _| {
+        explaining.at(share);
+    });
+    drop(explaining);
+    remarks.append(&mut report.remarks);
+    report.remarks = remarks;
+    report.inputs = data::Inputs {
+        model: arguments.model.display().to_string(),
+        recording: arguments.recording.display().to_string(),
+        reference: arguments
+            .reference
+            .as_ref()
+            .map(|path| path.display().to_string()),
+        out: Some(out.display().to_string()),
+    };
+    let extended = extended(&model, &report, &arguments.model, out)?;
+    let mut files = vec![
+        ("report.json", json::render(&report)),
+        ("report.html", html::render(&report)),
+        ("model.toml", extended),
+    ];
+    if let Some(calibration) = calibration::render(&model, &report) {
+        files.push(("calibration.toml", calibration));
+    }
+    write(out, &files)?;
+    let width = std::env::var("COLUMNS")
+        .ok()
+        .and_then(|width| width.parse().ok());
+    Ok(text::render(&report, width.unwrap_or(WIDTH))
+        .trim_end()
+        .to_owned())
+}
+
+/// All files, or none.
+fn write(folder: &Path, files: &[(&str, String)]) -> Result<(), Failure> {
+    let is_new = !folder.exists();
+    fs::create_dir_all(folder).map_err(|error| Error::writing(folder, &error))?;
+    let written = (|| {
+        let mut finished = Vec::new();
+        for (name, content) in files {
+            let path = folder.join(name);
+            let mut file = WholeFile::create(&path)?;
+            file.write_all(content.as_bytes())
+                .map_err(|error| Error::writing(&path, &error))?;
+            finished.push(file);
+        }
+        finished.into_iter().try_for_each(WholeFile::finish)
+    })();
+    if let Err(error) = written {
+        if is_new {
+            // Empty, or not ours any more.
+            let _ = fs::remove_dir(folder);
+        }
+        return Err(error.into());
+    }
+    // One that an earlier run has left would not belong to this report.
+    let calibration = folder.join("calibration.toml");
+    if files.iter().all(|(name, _)| *name != "calibration.toml") && calibration.exists() {
+        fs::remove_file(&calibration).map_err(|error| Error::writing(&calibration, &error))?;
+    }
+    Ok(())
+}
+
+/// The model file with what was found.
+fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<String, Failure> {
+    let mut found: Vec<Found> = Vec::new();
+    let mut shift = Shift::default();
+    for fitted in &report.models {
+        for (id, parameters) in &fitted.effects {
+            let said = report
+                .effects
+                .iter()
+                .find(|effect| effect.id == *id && effect.signal == fitted.signal);
+            // What was fitted and then not named does not belong to the model.
+            let Some(said) = said else {
+                continue;
+            };
+            if let Some(known) = found.iter_mut().find(|known| known.id == *id) {
+                let values: Vec<String> = parameters
+                    .iter()
+                    .map(|(name, value)| format!("{name} = {value}"))
+                    .collect();
+                known
+                    .comment
+                    .push(format!("From {}: {}.", fitted.signal, values.join(", ")));
+                continue;
+            }
+            let mut comment = vec![
+                format!(
+                    "Found by twin explain in {}: {}",
+                    report.inputs.recording, said.statement
+                ),
+                said.equation.clone(),
+            ];
+            for parameter in &said.parameters {
+                comment.push(format!(
+                    "{}: 95 % interval {} to {} {}",
+                    parameter.name, parameter.ci95[0], parameter.ci95[1], parameter.unit
+                ));
+            }
+            found.push(Found {
+                id: id.clone(),
+                parameters: parameters.clone(),
+                comment: comment
+                    .iter()
+                    .map(|line| line.replace(['\n', '\r'], " "))
+                    .collect(),
+            });
+        }
+        if !found.is_empty() {
+            shift.take(fitted.nuisance);
+        }
+    }
+    model.extended(&found, shift, file.parent().unwrap_or(Path::new("")), out)
+}

@@ -1,0 +1,181 @@
+//! The model file with effects added.
+
+use std::{
+    fs,
+    path::{Component, Path, PathBuf},
+};
+
+use toml_edit::{DocumentMut, Item, Table, TableLike, value};
+
+use super::Battery;
+use crate::{effects::chain::Nuisance, failure::Failure};
+
+/// An effect to be written into a model file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Found {
+    /// Its id.
+    pub id: String,
+    /// Names and values of its parameters.
+    pub parameters: Vec<(String, f64)>,
+    /// What is said of it, line by line; becomes a comment.
+    pub comment: Vec<String>,
+}
+
+/// What the battery differs by, within what the model file says it does not know.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Shift {
+    /// Added to the initial state of charge, 0 … 1.
+    pub soc: f64,
+    /// Relative change of the ohmic resistance.
+    pub resistance: f64,
+    /// Time by which readings stand for an earlier moment than their row, in s.
+    pub alignment_s: f64,
+}
+
+impl Shift {
+    /// What was found for one signal; the first that says something counts.
+    pub fn take(&mut self, nuisance: Nuisance) {
+        if *self == Self::default() {
+            *self = Self {
+                soc: nuisance.soc_shift,
+                resistance: nuisance.resistance,
+                alignment_s: nuisance.alignment_s,
+            };
+        }
+    }
+}
+
+/// What is written into a model file.
+pub(super) struct Extension<'a> {
+    pub source: &'a str,
+    pub battery: Option<&'a Battery>,
+    pub effects: &'a [Found],
+    pub shift: Shift,
+    pub from: &'a Path,
+    pub to: &'a Path,
+}
+
+impl Extension<'_> {
+    /// `text` with it; everything else stays as it is.
+    pub(super) fn write(&self, text: &str) -> Result<String, Failure> {
+        let mut document: DocumentMut = text.parse().map_err(|_| self.wrong("not TOML"))?;
+        if let Some(battery) = document
+            .get_mut("battery")
+            .and_then(Item::as_table_like_mut)
+        {
+            self.battery(battery);
+        }
+        if self.shift.alignment_s != 0.0
+            && let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut)
+        {
+            set(sensor, "alignment_s", value(self.shift.alignment_s));
+        }
+        if !self.effects.is_empty() {
+            self.effects(&mut document)?;
+        }
+        let mut written = document.to_string();
+        if !written.ends_with('\n') {
+            written.push('\n');
+        }
+        Ok(written)
+    }
+
+    fn wrong(&self, what: &str) -> Failure {
+        Failure::Input(format!(
+            "{}: {what}, expected tables [effects.<id>]",
+            self.source
+        ))
+    }
+
+    fn effects(&self, document: &mut DocumentMut) -> Result<(), Failure> {
+        let place = document.as_table_mut().entry("effects").or_insert_with(|| {
+            let mut table = Table::new();
+            // Only [effects.<id>] is written, not an empty [effects].
+            table.set_implicit(true);
+            Item::Table(table)
+        });
+        for effect in self.effects {
+            let place = place
+                .as_table_like_mut()
+                .ok_or_else(|| self.wrong("effects is no table"))?;
+            let mut table = Table::new();
+            for (name, number) in &effect.parameters {
+                // Written in full: reading it back gives the same number.
+                table.insert(name, value(*number));
+            }
+            let comment: String = effect
+                .comment
+                .iter()
+                .map(|line| format!("# {line}\n"))
+                .collect();
+            table.decor_mut().set_prefix(format!("\n{comment}"));
+            place.insert(&effect.id, Item::Table(table));
+        }
+        Ok(())
+    }
+
+    fn battery(&self, table: &mut dyn TableLike) {
+        let file = table
+            .get("ocv_file")
+            .and_then(Item::as_str)
+            .map(PathBuf::from);
+        if let Some(file) = file.filter(|file| file.is_relative())
+            && let Some(from_there) = relative(&self.from.join(file), self.to)
+        {
+            set(table, "ocv_file", value(from_there));
+        }
+        let Some(battery) = self.battery else {
+            return;
+        };
+        if let Some(soc) = battery.initial_soc.filter(|_| self.shift.soc != 0.0) {
+            set(
+                table,
+                "initial_soc",
+                value((soc + self.shift.soc).clamp(0.0, 1.0)),
+            );
+        }
+        if self.shift.resistance != 0.0 {
+            let resistance = battery.resistance_ohm * (1.0 + self.shift.resistance);
+            set(table, "ohmic_resistance_ohm", value(resistance));
+        }
+    }
+}
+
+/// Replaces a value; its comment stays.
+fn set(table: &mut dyn TableLike, key: &str, mut new: Item) {
+    let Some(place) = table.get_mut(key) else {
+        table.insert(key, new);
+        return;
+    };
+    if let (Some(old), Some(new)) = (place.as_value(), new.as_value_mut()) {
+        *new.decor_mut() = old.decor().clone();
+    }
+    *place = new;
+}
+
+/// A file as named from another folder, which need not be there yet. `None` where neither can be found.
+fn relative(file: &Path, folder: &Path) -> Option<String> {
+    let file = fs::canonicalize(file).ok()?;
+    // The part of the folder that is there already, and what will be made below it.
+    let mut there = std::path::absolute(folder).ok()?;
+    let mut below = Vec::new();
+    let base = loop {
+        if let Ok(found) = fs::canonicalize(&there) {
+            break found;
+        }
+        below.push(there.file_name()?.to_owned());
+        there = there.parent()?.to_owned();
+    };
+    let folder: PathBuf = base.join(below.iter().rev().collect::<PathBuf>());
+    let (file_parts, folder_parts): (Vec<Component<'_>>, Vec<Component<'_>>) =
+        (file.components().collect(), folder.components().collect());
+    let common = file_parts
+        .iter()
+        .zip(&folder_parts)
+        .take_while(|(one, other)| one == other)
+        .count();
+    let mut path = PathBuf::new();
+    path.extend(folder_parts[common..].iter().map(|_| Component::ParentDir));
+    path.extend(&file_parts[common..]);
+    Some(path.to_str()?.replace('\\', "/"))
+}

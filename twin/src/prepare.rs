@@ -1,0 +1,564 @@
+//! From recording and model file to problems: one for each signal that can be compared.
+//!
+//! Nothing is invented: a missing reading is masked, a row without a reference is not part of the drive, a reading that a
+//! sensor merely holds counts once. Only the surroundings (temperatures, supply) are held over gaps.
+
+mod battery;
+mod charge;
+pub mod checks;
+mod frame;
+mod held;
+mod series;
+
+use std::path::PathBuf;
+
+use recording::name;
+
+pub use frame::Frame;
+pub use held::{Freshness, freshness};
+
+use crate::{
+    align, explain,
+    failure::Failure,
+    model::{Model, Sensor, registry},
+    problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View},
+    simulate::board::{Board, Pace},
+};
+
+/// Fewest readings that are compared: below, no held-out block is long enough to say anything.
+pub const FEWEST_ROWS: usize = 50;
+
+/// Columns of a reference and of the sensor beside it, in the order in which they are looked for.
+const PAIRS: [(&str, &str); 2] = [("i_ref_a", "i_meas_a"), ("p_ref_w", "p_meas_w")];
+
+/// What is read.
+#[derive(Clone, Debug, Default)]
+pub struct Inputs {
+    /// The recording.
+    pub recording: PathBuf,
+    /// A second recording with the reference, on a clock of its own.
+    pub reference: Option<PathBuf>,
+    /// `NAME=COLUMN`.
+    pub mapping: Vec<String>,
+}
+
+/// What for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// To compare: what was recorded of each signal has to be there, and plausible.
+    Compare,
+    /// To simulate: the drive is enough.
+    Simulate,
+}
+
+/// A problem and where its rows are from.
+#[derive(Clone, Debug)]
+pub struct Item {
+    /// The problem.
+    pub problem: Problem,
+    /// Row of the recording that each observed row is from.
+    pub rows: Vec<usize>,
+    /// When the board's conversions end, for a sensor.
+    pub pace: Pace,
+    /// Rows at which a board's new conversion shows for the first time; empty: all.
+    pub fresh: Vec<bool>,
+}
+
+/// Everything that explaining and simulating need.
+#[derive(Clone, Debug)]
+pub struct Prepared {
+    /// The problems.
+    pub items: Vec<Item>,
+    /// What the reader has to know about the input.
+    pub remarks: Vec<String>,
+    /// Time of each row of the recording, in s, on its own clock.
+    pub t_s: Vec<f64>,
+}
+
+impl Prepared {
+    /// The problems alone.
+    pub fn problems(&self) -> Vec<Problem> {
+        self.items.iter().map(|item| item.problem.clone()).collect()
+    }
+}
+
+/// Reads and checks.
+pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepared, Failure> {
+    let (frame, reference) = frame::read(model, inputs)?;
+    let mut work = Work {
+        model,
+        frame: &frame,
+        reference: reference.as_ref(),
+        purpose,
+        remarks: Vec::new(),
+        clock: None,
+    };
+    let mut items = Vec::new();
+    if let Some(sensor) = &model.sensor {
+        items.extend(work.sensor(sensor)?);
+    }
+    if let Some(battery) = &model.battery {
+        items.extend(battery::items(&mut work, battery)?);
+    }
+    if items.is_empty() {
+        return Err(nothing_to_compare(model, &frame));
+    }
+    for item in &mut items {
+        model_effects(model, item);
+        if purpose == Purpose::Compare {
+            checks::enough(&item.problem, frame.source())?;
+        }
+    }
+    Ok(Prepared {
+        items,
+        remarks: work.remarks,
+        t_s: frame.t_s().to_vec(),
+    })
+}
+
+fn nothing_to_compare(model: &Model, frame: &Frame) -> Failure {
+    let mut wanted = Vec::new();
+    if model.sensor.is_some() {
+        wanted.push("a reference with the sensor under test (i_ref_a with i_meas_a or q_meas_c, p_ref_w with p_meas_w)");
+    }
+    if let Some(battery) = &model.battery {
+        wanted.push(if battery.ocv.is_empty() {
+            "a current with soc_pct (and a voltage, if [battery] had ocv or ocv_file)"
+        } else {
+            "a current with soc_pct, v_cell_v or v_pack_v"
+        });
+    }
+    Failure::Input(format!(
+        "{}: found the columns {}, expected {}; other names: --map NAME=COLUMN, or [columns] in {}",
+        frame.source(),
+        frame.names().join(", "),
+        wanted.join(", or "),
+        model.source
+    ))
+}
+
+/// What is known while problems are made.
+struct Work<'a> {
+    model: &'a Model,
+    frame: &'a Frame,
+    reference: Option<&'a Frame>,
+    purpose: Purpose,
+    remarks: Vec<String>,
+    /// Time of the recording's rows on the reference's clock, once it has been found.
+    clock: Option<Vec<f64>>,
+}
+
+impl Work<'_> {
+    /// The frame that the reference is in.
+    fn drive_frame(&self) -> &Frame {
+        self.reference.unwrap_or(self.frame)
+    }
+
+    fn remark(&mut self, remark: String) {
+        if !self.remarks.contains(&remark) {
+            self.remarks.push(remark);
+        }
+    }
+
+    /// The sensor, and its charge counter.
+    fn sensor(&mut self, sensor: &Sensor) -> Result<Vec<Item>, Failure> {
+        let (reference, measured) = self.names(sensor)?;
+        let found = self.drive_frame().need(&reference)?;
+        checks::some_values(&found, &reference, self.drive_frame().source())?;
+        let value = self.frame.column(&measured);
+        let counter = self.charge_column();
+        if value.is_none() && (self.purpose == Purpose::Compare) && counter.is_none() {
+            // Asked for by name, or nothing else to do: the error names the columns that are there.
+            if sensor.measured.is_some() || self.model.battery.is_none() {
+                self.frame.need(&measured)?;
+            }
+            return Ok(Vec::new());
+        }
+        if let Some(value) = &value
+            && self.purpose == Purpose::Compare
+        {
+            checks::some_values(value, &measured, self.frame.source())?;
+            checks::not_constant(value, &measured, self.frame.source())?;
+            checks::not_constant(&found, &reference, self.drive_frame().source())?;
+        }
+        let board = Board::new(sensor.front_end, sensor.average.unwrap_or(1));
+        let fresh = match &value {
+            Some(value) => freshness(
+                self.frame,
+                &found,
+                value,
+                self.reference.is_none(),
+                sensor.interval_s,
+            ),
+            None => Freshness::all(self.frame.t_s().len()),
+        };
+        if let Some(interval_s) = fresh.interval_s {
+            self.remark(format!(
+                "{measured} is read more often than it is measured: a new value about every {}; repeats are left out",
+                seconds(interval_s)
+            ));
+        }
+        self.find_clock(&found, value.as_deref(), &fresh, &measured)?;
+        let parts = series::drive(self.drive_frame(), &found);
+        let mut drive = parts.drive;
+        self.surroundings(&mut drive, &parts.rows);
+        let (observed, rows) = match &value {
+            Some(value) => self.observe(&drive, &parts.rows, &parts.clocks, value, &fresh),
+            None => series::every_row(&drive, &parts.rows),
+        };
+        if self.purpose == Purpose::Compare && value.is_some() {
+            let (errors, remarks) = (
+                checks::pair(&drive, &observed, &reference, &measured),
+                checks::plausible(&drive, &observed, sensor, &reference, &measured),
+            );
+            for remark in remarks {
+                self.remark(remark);
+            }
+            errors?;
+        }
+        let pace = match (&value, &board) {
+            (None, _) => Pace::Free,
+            (Some(_), Some(board)) if series::spacing_s(&observed) > 1.5 * board.conversion_s() => {
+                Pace::Between
+            }
+            _ => Pace::Seen,
+        };
+        let mut items = Vec::new();
+        let unit = name::unit(&measured)
+            .or_else(|| name::unit(&reference))
+            .unwrap_or("1")
+            .to_owned();
+        if value.is_some() || self.purpose == Purpose::Simulate {
+            let (problem, fresh) = self.sensor_problem(
+                sensor,
+                board.as_ref(),
+                &drive,
+                &observed,
+                pace,
+                &measured,
+                &unit,
+            );
+            items.push(Item {
+                problem,
+                rows: rows.clone(),
+                pace,
+                fresh,
+            });
+        }
+        if let Some(counter) = counter {
+            items.extend(charge::item(
+                self,
+                sensor,
+                board.as_ref(),
+                &drive,
+                &parts.clocks,
+                &counter,
+            )?);
+        }
+        Ok(items)
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "the parts of one problem")]
+    fn sensor_problem(
+        &mut self,
+        sensor: &Sensor,
+        board: Option<&Board>,
+        drive: &Drive,
+        observed: &Observed,
+        pace: Pace,
+        measured: &str,
+        unit: &str,
+    ) -> (Problem, Vec<bool>) {
+        let mut fresh = Vec::new();
+        let mut drive = drive.clone();
+        let mut observed = observed.clone();
+        let mut base = SensorBase {
+            window_s: sensor.window_s,
+            step: sensor.step,
+            full_scale: sensor.full_scale,
+            range_limit: sensor.range_limit,
+            held_reference: sensor.held_reference,
+            alignment_s: sensor.alignment_s,
+            ..SensorBase::default()
+        };
+        if let Some(board) = board {
+            base.step = board.step_a();
+            base.full_scale = Some(board.full_scale_a());
+            base.range_limit = board.range_limit_a();
+            base.range_ratio = board.range_ratio();
+            base.window_s = board.conversion_s() * f64::from(board.average());
+            let reported = board.run(&drive, sensor.held_reference, &observed, pace, false);
+            self.compare_range_flag(board, &mut drive, &observed, &reported.range_high);
+            base.reading = reported.current_a;
+            fresh = reported.fresh;
+            let mut spoiled = 0;
+            for (row, reading) in base.reading.iter().enumerate() {
+                if reading.is_nan() && observed.valid[row] {
+                    observed.valid[row] = false;
+                    spoiled += 1;
+                }
+            }
+            if spoiled > 0 {
+                self.remark(format!(
+                    "{spoiled} readings of {measured} left out: a range change fell into their conversion, and the board itself marks them invalid"
+                ));
+            }
+        }
+        let step = base.step;
+        let problem = Problem {
+            view: View::Sensor,
+            name: measured.to_owned(),
+            unit: unit.to_owned(),
+            drive,
+            observed,
+            base: Base::Sensor(base),
+            modelled: Vec::new(),
+            noise: (sensor.noise.powi(2) + sensor.noise_coloured.powi(2) + step * step / 12.0)
+                .sqrt(),
+            accuracy: Accuracy {
+                zero: sensor.accuracy.zero,
+                gain: sensor.accuracy.gain,
+            },
+        };
+        (problem, fresh)
+    }
+
+    /// The range flag of the simulated board where none was recorded, and a remark where it differs from a recorded one.
+    fn compare_range_flag(
+        &mut self,
+        board: &Board,
+        drive: &mut Drive,
+        observed: &Observed,
+        simulated: &[f64],
+    ) {
+        if !board.has_two_ranges() {
+            return;
+        }
+        match &drive.range_high {
+            None if observed.on_drive_rows => {
+                drive.range_high = Some(simulated.to_vec());
+                self.remark(
+                    "range_high was not recorded: the simulated board's is used".to_owned(),
+                );
+            }
+            Some(recorded) if observed.on_drive_rows => {
+                let differ = recorded
+                    .iter()
+                    .zip(simulated)
+                    .filter(|(recorded, simulated)| (*recorded - *simulated).abs() > 0.5)
+                    .count();
+                if differ * 50 > recorded.len() {
+                    self.remark(format!(
+                        "range_high differs from the simulated board's in {differ} of {} rows",
+                        recorded.len()
+                    ));
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Names of reference and sensor.
+    fn names(&self, sensor: &Sensor) -> Result<(String, String), Failure> {
+        let has = |name: &str| self.drive_frame().has(name);
+        let pair = PAIRS
+            .iter()
+            .find(|(reference, measured)| has(reference) && self.frame.has(measured))
+            .or_else(|| PAIRS.iter().find(|(reference, _)| has(reference)));
+        let reference = match (&sensor.reference, pair) {
+            (Some(stated), _) => stated.clone(),
+            (None, Some((reference, _))) => (*reference).to_owned(),
+            (None, None) => {
+                self.drive_frame().need(PAIRS[0].0)?;
+                PAIRS[0].0.to_owned()
+            }
+        };
+        let measured = sensor.measured.clone().unwrap_or_else(|| {
+            let beside = PAIRS.iter().find(|(known, _)| *known == reference);
+            let beside = beside.or(pair).unwrap_or(&PAIRS[0]);
+            beside.1.to_owned()
+        });
+        Ok((reference, measured))
+    }
+
+    /// The counter's column, if it is there or asked for.
+    fn charge_column(&self) -> Option<String> {
+        let stated = self
+            .model
+            .charge
+            .as_ref()
+            .and_then(|charge| charge.column.clone());
+        let name = stated.unwrap_or_else(|| "q_meas_c".to_owned());
+        self.frame.has(&name).then_some(name)
+    }
+
+    /// Where the reference has a clock of its own: offset and rate between the two.
+    fn find_clock(
+        &mut self,
+        found: &[f64],
+        value: Option<&[f64]>,
+        fresh: &Freshness,
+        measured: &str,
+    ) -> Result<(), Failure> {
+        let Some(reference) = self.reference else {
+            return Ok(());
+        };
+        if self.clock.is_some() {
+            return Ok(());
+        }
+        for frame in [reference, self.frame] {
+            if frame.clocks().len() > 1 {
+                return Err(Failure::Input(format!(
+                    "{}: found a clock that starts anew with each cycle, expected one clock for the whole file where --reference is given",
+                    frame.source()
+                )));
+            }
+        }
+        let Some(value) = value else {
+            return Err(Failure::Input(format!(
+                "{}: found no column {measured}, expected it beside --reference: the clocks are compared by it",
+                self.frame.source()
+            )));
+        };
+        let sensed = align::Signal::new(self.frame.t_s(), value, |row| fresh.rows[row]);
+        let driven = align::Signal::new(reference.t_s(), found, |_| true);
+        let alignment = align::estimate(&driven, &sensed).map_err(|what| {
+            Failure::Input(format!(
+                "{} and {}: {what}",
+                reference.source(),
+                self.frame.source()
+            ))
+        })?;
+        self.remark(alignment.remark());
+        self.clock = Some(
+            self.frame
+                .t_s()
+                .iter()
+                .map(|t| alignment.on_reference(*t))
+                .collect(),
+        );
+        Ok(())
+    }
+
+    /// Environment columns, from the drive's own file or else from the other one.
+    fn surroundings(&self, drive: &mut Drive, rows: &[usize]) {
+        let held = |name: &str| {
+            if let Some(values) = self.drive_frame().column(name) {
+                return series::held_over_gaps(rows.iter().map(|row| values[*row]));
+            }
+            let clock = self.clock.as_ref()?;
+            let values = self.frame.column(name)?;
+            series::held_at(clock, &values, &drive.t_s)
+        };
+        let surroundings = [
+            "temp_sensor_c",
+            "v_supply_v",
+            "i_aux_a",
+            "range_high",
+            "temp_cell_c",
+            "temp_ambient_c",
+        ]
+        .map(held);
+        [
+            drive.sensor_temperature_c,
+            drive.supply_v,
+            drive.aux_a,
+            drive.range_high,
+            drive.cell_temperature_c,
+            drive.ambient_c,
+        ] = surroundings;
+    }
+
+    /// Where and when a column was recorded.
+    fn observe(
+        &self,
+        drive: &Drive,
+        rows: &[usize],
+        clocks: &[usize],
+        value: &[f64],
+        fresh: &Freshness,
+    ) -> (Observed, Vec<usize>) {
+        match (&self.clock, self.reference) {
+            (Some(clock), Some(_)) => series::own_rows(
+                drive,
+                clocks,
+                self.frame.clocks(),
+                clock,
+                value,
+                &fresh.rows,
+            ),
+            _ => {
+                let frame = self.frame;
+                if series::share_rows(rows, value) {
+                    series::drive_rows(drive, rows, value, &fresh.rows)
+                } else {
+                    series::own_rows(
+                        drive,
+                        clocks,
+                        frame.clocks(),
+                        frame.t_s(),
+                        value,
+                        &fresh.rows,
+                    )
+                }
+            }
+        }
+    }
+}
+
+/// Puts the effects of the model file into a problem, those that act in its view.
+fn model_effects(model: &Model, item: &mut Item) {
+    let problem = &mut item.problem;
+    let battery = matches!(problem.view, View::StateOfCharge | View::Voltage);
+    problem.modelled = model
+        .effects
+        .iter()
+        .filter(|(id, _)| registry::of_battery(id) == battery)
+        .cloned()
+        .collect();
+    if problem.modelled.is_empty() {
+        return;
+    }
+    let empty = |problem: &Problem| {
+        let mut plain = problem.clone();
+        plain.modelled.clear();
+        if let Base::Sensor(base) = &mut plain.base {
+            base.reading.clear();
+        }
+        plain
+    };
+    let plain = empty(problem);
+    let Base::Sensor(base) = &mut problem.base else {
+        return;
+    };
+    if base.reading.is_empty() {
+        return;
+    }
+    // A board's reading with the effects in it: what they change of an ideal sensor's reading.
+    let effects: Vec<(String, Vec<f64>)> = problem
+        .modelled
+        .iter()
+        .map(|(id, values)| ((*id).to_owned(), values.clone()))
+        .collect();
+    let (with, without) = (
+        explain::predict(&plain, &effects),
+        explain::predict(&plain, &[]),
+    );
+    // Between two conversions the board holds its reading, with what the effects made of it.
+    let mut held = 0.0;
+    for (row, reading) in base.reading.iter_mut().enumerate() {
+        if item.fresh.get(row).is_none_or(|fresh| *fresh) {
+            held = with[row] - without[row];
+        }
+        *reading += held;
+    }
+}
+
+/// A time in a remark.
+pub(crate) fn seconds(s: f64) -> String {
+    if s.abs() < 1.0 {
+        format!("{:.3} ms", s * 1e3)
+    } else {
+        format!("{s:.3} s")
+    }
+}

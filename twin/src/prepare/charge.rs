@@ -1,0 +1,181 @@
+//! The charge counter: differences of its readings over time, as mean currents.
+
+use super::{FEWEST_ROWS, Item, Purpose, Work, checks, series};
+use crate::{
+    failure::Failure,
+    model::Sensor,
+    problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View},
+    simulate::board::{Board, Pace},
+};
+
+/// Time over which two readings of the counter are compared if nothing is stated: a count of the board's small range is
+/// then 6.7 mA.
+const INTERVAL_S: f64 = 1.0;
+/// A mean current this many times beyond the largest reference is no charge but a counter that was set anew.
+const RESET: f64 = 3.0;
+
+/// The problem of the counter; `None` where nothing is to be compared.
+pub(super) fn item(
+    work: &mut Work<'_>,
+    sensor: &Sensor,
+    board: Option<&Board>,
+    drive: &Drive,
+    clocks: &[usize],
+    column: &str,
+) -> Result<Option<Item>, Failure> {
+    let value = work.frame.need(column)?;
+    let known = value.iter().filter(|value| value.is_finite()).count();
+    if known < FEWEST_ROWS && work.purpose == Purpose::Simulate {
+        return Ok(None);
+    }
+    checks::some_values(&value, column, work.frame.source())?;
+    let spec = work.model.charge.clone().unwrap_or_default();
+    let step_c = board.map_or(spec.step_c, Board::charge_step_c);
+    let every = vec![true; value.len()];
+    let (readings, rows) = match &work.clock {
+        Some(clock) => series::own_rows(drive, clocks, work.frame.clocks(), clock, &value, &every),
+        None => series::own_rows(
+            drive,
+            clocks,
+            work.frame.clocks(),
+            work.frame.t_s(),
+            &value,
+            &every,
+        ),
+    };
+    let interval_s = spec.interval_s.unwrap_or(INTERVAL_S);
+    let largest = drive
+        .reference
+        .iter()
+        .fold(0.0_f64, |most, i| most.max(i.abs()));
+    let (drive, observed, rows, resets) =
+        differences(drive, &readings, &rows, interval_s, step_c, largest);
+    if resets > 0 {
+        work.remark(format!(
+            "{column} was set anew {resets} times; each begins a new stretch"
+        ));
+    }
+    let spacing_s = series::spacing_s(&observed).max(f64::MIN_POSITIVE);
+    let noise_c = (spec.noise_c.powi(2) + step_c * step_c / 12.0).sqrt();
+    let mut base = SensorBase {
+        // A counter has no window of its own.
+        step: step_c / spacing_s,
+        full_scale: sensor.full_scale,
+        range_limit: sensor.range_limit,
+        held_reference: sensor.held_reference,
+        alignment_s: sensor.alignment_s,
+        ..SensorBase::default()
+    };
+    let mut drive = drive;
+    if let Some(board) = board {
+        base.full_scale = Some(board.full_scale_a());
+        base.range_limit = board.range_limit_a();
+        base.range_ratio = board.range_ratio();
+        let reported = board.run(&drive, sensor.held_reference, &observed, Pace::Seen, true);
+        base.reading = means(&observed, &reported.charge_c);
+        if drive.range_high.is_none() && board.has_two_ranges() {
+            let (every, _) = series::every_row(&drive, &[]);
+            let flag = board.run(&drive, sensor.held_reference, &every, Pace::Free, false);
+            drive.range_high = Some(flag.range_high);
+        }
+    }
+    let problem = Problem {
+        view: View::Charge,
+        name: column.to_owned(),
+        unit: "A".to_owned(),
+        drive,
+        observed,
+        base: Base::Sensor(base),
+        modelled: Vec::new(),
+        // A difference has the noise of both of its readings.
+        noise: std::f64::consts::SQRT_2 * noise_c / spacing_s,
+        accuracy: Accuracy {
+            zero: sensor.accuracy.zero,
+            gain: sensor.accuracy.gain,
+        },
+    };
+    Ok(Some(Item {
+        problem,
+        rows,
+        pace: Pace::Seen,
+        fresh: Vec::new(),
+    }))
+}
+
+/// Readings `interval_s` apart as mean currents since the one before; the first of each segment has none. A counter that
+/// was set anew begins a segment.
+fn differences(
+    drive: &Drive,
+    readings: &Observed,
+    rows: &[usize],
+    interval_s: f64,
+    step_c: f64,
+    largest: f64,
+) -> (Drive, Observed, Vec<usize>, usize) {
+    let mut drive = drive.clone();
+    let mut observed = Observed::default();
+    let mut kept = Vec::new();
+    let mut resets = 0;
+    // Segments are renumbered where one is cut.
+    let mut shift = 0;
+    let mut last: Option<(usize, f64, f64)> = None;
+    for (index, row) in rows
+        .iter()
+        .enumerate()
+        .filter(|(index, _)| readings.valid[*index])
+    {
+        let (segment, now_s, charge) = (
+            readings.segment[index],
+            readings.t_s[index],
+            readings.value[index],
+        );
+        let mut mean = f64::NAN;
+        if let Some((before, before_s, before_c)) = last
+            && before == segment
+        {
+            let length_s = now_s - before_s;
+            let moved = charge - before_c;
+            let is_reset = moved.abs() > RESET * (largest * length_s + step_c) + 2.0 * step_c;
+            if is_reset {
+                let own = drive.segments[segment + shift].clone();
+                let cut = own.start + drive.t_s[own.clone()].partition_point(|t| *t < now_s);
+                if cut > own.start && cut < own.end {
+                    resets += 1;
+                    drive.segments[segment + shift] = own.start..cut;
+                    drive.segments.insert(segment + shift + 1, cut..own.end);
+                    drive.continues.insert(segment + shift + 1, true);
+                    shift += 1;
+                }
+            } else if length_s < interval_s * 0.999 || length_s <= 0.0 {
+                continue;
+            } else {
+                mean = moved / length_s;
+            }
+        }
+        last = Some((segment, now_s, charge));
+        observed.t_s.push(now_s);
+        observed.value.push(mean);
+        observed.valid.push(mean.is_finite());
+        observed.segment.push(segment + shift);
+        kept.push(*row);
+    }
+    (drive, observed, kept, resets)
+}
+
+/// The same of a simulated counter.
+fn means(observed: &Observed, charge_c: &[f64]) -> Vec<f64> {
+    let mut last: Option<(usize, f64, f64)> = None;
+    (0..charge_c.len())
+        .map(|row| {
+            let now = (observed.segment[row], observed.t_s[row], charge_c[row]);
+            let mean = match last {
+                Some((segment, before_s, before_c)) if segment == now.0 && now.1 > before_s => {
+                    (now.2 - before_c) / (now.1 - before_s)
+                }
+                _ => f64::NAN,
+            };
+            last = Some(now);
+            mean
+        })
+        .collect()
+}

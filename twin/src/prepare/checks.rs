@@ -1,0 +1,386 @@
+//! What cannot be explained because the input is not what it is said to be: each its own clear error.
+
+use super::{FEWEST_ROWS, seconds, series::median};
+use crate::{
+    failure::Failure,
+    model::Sensor,
+    problem::{BatteryBase, Drive, Observed, Problem, View},
+};
+
+/// A ratio of two spreads is a power of 1000 if it is within this factor of one.
+const POWER_WITHIN: f64 = 2.0;
+/// Below this correlation with its reference a sensor counts the other way round.
+const OPPOSITE: f64 = -0.5;
+/// Below this magnitude of correlation the two have nothing in common.
+const UNRELATED: f64 = 0.1;
+/// A share of the readings at an end of their range that is worth a remark.
+const CLIPPED_SHARE: f64 = 0.005;
+
+/// A column holds numbers at all.
+pub(super) fn some_values(values: &[f64], name: &str, source: &str) -> Result<(), Failure> {
+    if values.iter().any(|value| value.is_finite()) {
+        return Ok(());
+    }
+    Err(Failure::Input(format!(
+        "{source}, column {name}: found no value, expected numbers"
+    )))
+}
+
+/// A column moves.
+pub(super) fn not_constant(values: &[f64], name: &str, source: &str) -> Result<(), Failure> {
+    let mut known = values.iter().filter(|value| value.is_finite());
+    let Some(first) = known.next() else {
+        return Ok(());
+    };
+    if known.any(|value| value != first) {
+        return Ok(());
+    }
+    Err(Failure::Input(format!(
+        "{source}, column {name}: found {first} in every row, expected a signal that moves"
+    )))
+}
+
+/// There is enough to say something.
+pub(super) fn enough(problem: &Problem, source: &str) -> Result<(), Failure> {
+    let rows = problem.observed.valid_rows();
+    if rows >= FEWEST_ROWS {
+        return Ok(());
+    }
+    let drive = &problem.drive;
+    let outside = problem
+        .observed
+        .t_s
+        .iter()
+        .zip(&problem.observed.value)
+        .filter(|(_, value)| value.is_finite())
+        .count();
+    if rows == 0 && outside > 0 && !drive.is_empty() {
+        let span = |t_s: &[f64]| {
+            let (low, high) = t_s
+                .iter()
+                .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), t| {
+                    (low.min(*t), high.max(*t))
+                });
+            format!("{} … {} s", shown(low), shown(high))
+        };
+        return Err(Failure::Input(format!(
+            "{source}, column {}: found readings at {} and a reference at {}, expected both at the same time",
+            problem.name,
+            span(&problem.observed.t_s),
+            span(&drive.t_s)
+        )));
+    }
+    Err(Failure::Input(format!(
+        "{source}, column {}: found {rows} readings to compare, expected at least {FEWEST_ROWS}",
+        problem.name
+    )))
+}
+
+/// A time without the digits that a sum of steps leaves behind.
+fn shown(t_s: f64) -> f64 {
+    (t_s * 1e6).round() / 1e6
+}
+
+/// Readings that count with the reference at their time.
+pub(super) fn beside(drive: &Drive, observed: &Observed) -> (Vec<f64>, Vec<f64>) {
+    let mut pairs = (Vec::new(), Vec::new());
+    for row in (0..observed.t_s.len()).filter(|row| observed.valid[*row]) {
+        let reference = if observed.on_drive_rows {
+            drive.reference[row]
+        } else {
+            at(drive, observed.segment[row], observed.t_s[row])
+        };
+        pairs.0.push(reference);
+        pairs.1.push(observed.value[row]);
+    }
+    pairs
+}
+
+fn at(drive: &Drive, segment: usize, t_s: f64) -> f64 {
+    let Some(rows) = drive.segments.get(segment) else {
+        return f64::NAN;
+    };
+    let next = rows.start + drive.t_s[rows.clone()].partition_point(|t| *t <= t_s);
+    let before = next.saturating_sub(1).max(rows.start);
+    if next >= rows.end {
+        return drive.reference[before];
+    }
+    let h = drive.t_s[next] - drive.t_s[before];
+    if h <= 0.0 {
+        return drive.reference[before];
+    }
+    let share = ((t_s - drive.t_s[before]) / h).clamp(0.0, 1.0);
+    drive.reference[before] + share * (drive.reference[next] - drive.reference[before])
+}
+
+/// Distance between the 2nd and the 98th percentile.
+fn spread(values: &[f64]) -> f64 {
+    let mut sorted: Vec<f64> = values
+        .iter()
+        .copied()
+        .filter(|value| value.is_finite())
+        .collect();
+    if sorted.len() < 2 {
+        return 0.0;
+    }
+    sorted.sort_by(f64::total_cmp);
+    let at = |share: f64| sorted[((sorted.len() - 1) as f64 * share).round() as usize];
+    let wide = at(0.98) - at(0.02);
+    if wide > 0.0 { wide } else { at(1.0) - at(0.0) }
+}
+
+/// Pearson's correlation; 0 where one does not move.
+pub(super) fn correlation(one: &[f64], other: &[f64]) -> f64 {
+    let count = one.len().min(other.len()) as f64;
+    if count < 2.0 {
+        return 0.0;
+    }
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / count;
+    let (mean_one, mean_other) = (mean(one), mean(other));
+    let (mut cross, mut square_one, mut square_other) = (0.0, 0.0, 0.0);
+    for (x, y) in one.iter().zip(other) {
+        let (x, y) = (x - mean_one, y - mean_other);
+        cross += x * y;
+        square_one += x * x;
+        square_other += y * y;
+    }
+    if square_one > 0.0 && square_other > 0.0 {
+        cross / (square_one * square_other).sqrt()
+    } else {
+        0.0
+    }
+}
+
+/// The power of 1000 that a ratio is near to, if it is not the 0th.
+fn thousands(ratio: f64) -> Option<i32> {
+    if !(ratio > 0.0 && ratio.is_finite()) {
+        return None;
+    }
+    let power = (ratio.log10() / 3.0).round();
+    let near = (ratio / 1000_f64.powf(power)).ln().abs() <= POWER_WITHIN.ln();
+    (power != 0.0 && near).then_some(power as i32)
+}
+
+/// Units and signs of a sensor and its reference.
+pub(super) fn pair(
+    drive: &Drive,
+    observed: &Observed,
+    reference: &str,
+    measured: &str,
+) -> Result<(), Failure> {
+    let (x, y) = beside(drive, observed);
+    if x.len() < FEWEST_ROWS {
+        return Ok(());
+    }
+    let (spread_x, spread_y) = (spread(&x), spread(&y));
+    if let Some(power) = thousands(spread_x / spread_y) {
+        let (large, small) = if power > 0 {
+            (reference, measured)
+        } else {
+            (measured, reference)
+        };
+        let factor = 1000_f64.powi(power.abs());
+        return Err(Failure::Input(format!(
+            "{large} moves by {:.4} and {small} by {:.4}, a factor near {factor}: found two units, expected the same \
+             unit in both (one of them may be in thousandths)",
+            spread_x.max(spread_y),
+            spread_x.min(spread_y)
+        )));
+    }
+    let together = correlation(&x, &y);
+    if together < OPPOSITE {
+        return Err(Failure::Input(format!(
+            "{measured} falls where {reference} rises (correlation {together:.2}): found opposite signs, expected \
+             discharge positive in both; to turn one: --map {measured}=-{measured}"
+        )));
+    }
+    Ok(())
+}
+
+/// Whether the reference is one: remarks on what it does that no current does.
+pub(super) fn plausible(
+    drive: &Drive,
+    observed: &Observed,
+    sensor: &Sensor,
+    reference: &str,
+    measured: &str,
+) -> Vec<String> {
+    let mut remarks = Vec::new();
+    let (x, y) = beside(drive, observed);
+    if x.len() < FEWEST_ROWS {
+        return remarks;
+    }
+    let together = correlation(&x, &y);
+    if together.abs() < UNRELATED {
+        remarks.push(format!(
+            "{measured} does not follow {reference} (correlation {together:.2}): the reference may be that of another conductor"
+        ));
+    }
+    if let Some(full_scale) = sensor.full_scale {
+        let beyond = drive
+            .reference
+            .iter()
+            .filter(|i| i.abs() > full_scale)
+            .count();
+        let most = drive
+            .reference
+            .iter()
+            .fold(0.0_f64, |most, i| most.max(i.abs()));
+        if beyond > 0 {
+            remarks.push(format!(
+                "{reference} is beyond the sensor's full scale of {full_scale} in {beyond} of {} rows, at most {most}",
+                drive.len()
+            ));
+        }
+    }
+    remarks.extend(clipped(&x, &y, measured));
+    remarks.extend(spikes(drive, observed, reference));
+    remarks.extend(stuck(drive, observed, reference, measured));
+    remarks
+}
+
+/// Readings that stand at their highest or lowest value while the reference moves.
+fn clipped(x: &[f64], y: &[f64], measured: &str) -> Vec<String> {
+    let (low, high) = y
+        .iter()
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
+            (low.min(*value), high.max(*value))
+        });
+    let mut remarks = Vec::new();
+    for (end, what) in [(high, "highest"), (low, "lowest")] {
+        let inside: Vec<f64> = x
+            .iter()
+            .zip(y)
+            .filter(|(_, value)| **value == end)
+            .map(|(reference, _)| *reference)
+            .collect();
+        let enough = inside.len() >= 5 && inside.len() as f64 >= CLIPPED_SHARE * y.len() as f64;
+        // At rest every reading may be the lowest one: then the reference does not move there either.
+        if enough && spread(&inside) > 0.02 * spread(x) {
+            remarks.push(format!(
+                "{measured} stands at its {what} value {end} in {} of {} readings: it may be clipped",
+                inside.len(),
+                y.len()
+            ));
+        }
+    }
+    remarks
+}
+
+/// Single rows of the reference that jump there and back, which the sensor does not show.
+fn spikes(drive: &Drive, observed: &Observed, reference: &str) -> Option<String> {
+    if !observed.on_drive_rows {
+        return None;
+    }
+    let mut steps: Vec<f64> = drive
+        .segments
+        .iter()
+        .flat_map(|rows| {
+            drive.reference[rows.clone()]
+                .windows(2)
+                .map(|pair| (pair[1] - pair[0]).abs())
+        })
+        .collect();
+    let typical = median(&mut steps)?;
+    let wide = spread(&drive.reference);
+    let mut found = Vec::new();
+    for rows in &drive.segments {
+        for row in rows.start + 1..rows.end.saturating_sub(1) {
+            let (before, now, after) = (
+                drive.reference[row - 1],
+                drive.reference[row],
+                drive.reference[row + 1],
+            );
+            let jump = (now - before).abs().min((now - after).abs());
+            let back = (now - before) * (now - after) > 0.0;
+            let sensor = [row - 1, row, row + 1].map(|row| observed.value[row]);
+            let shown = (sensor[1] - 0.5 * (sensor[0] + sensor[2])).abs();
+            if back && jump > wide.max(20.0 * typical) && shown < 0.1 * jump {
+                found.push(drive.t_s[row]);
+            }
+        }
+    }
+    let first = found.first()?;
+    Some(format!(
+        "{reference} jumps there and back within one row in {} places that the sensor does not show, the first at {first} s: \
+         the reference may be at fault",
+        found.len()
+    ))
+}
+
+/// A stretch in which the reference stands still to the last digit while the sensor moves.
+fn stuck(drive: &Drive, observed: &Observed, reference: &str, measured: &str) -> Option<String> {
+    if !observed.on_drive_rows {
+        return None;
+    }
+    let wide = spread(&observed.value);
+    for rows in &drive.segments {
+        let mut start = rows.start;
+        while start < rows.end {
+            let mut end = start + 1;
+            while end < rows.end && drive.reference[end] == drive.reference[start] {
+                end += 1;
+            }
+            let inside: Vec<f64> = (start..end)
+                .filter(|row| observed.valid[*row])
+                .map(|row| observed.value[row])
+                .collect();
+            if inside.len() >= 20 && spread(&inside) > 0.3 * wide {
+                return Some(format!(
+                    "{reference} stands at {} for {} from {} s on while {measured} moves: the reference may be at fault",
+                    drive.reference[start],
+                    seconds(drive.t_s[end - 1] - drive.t_s[start]),
+                    drive.t_s[start]
+                ));
+            }
+            start = end;
+        }
+    }
+    None
+}
+
+/// Units and signs of a battery.
+pub(super) fn battery(
+    view: View,
+    drive: &Drive,
+    observed: &Observed,
+    base: &BatteryBase,
+    name: &str,
+    current: &str,
+) -> Result<(), Failure> {
+    let (x, y) = beside(drive, observed);
+    if y.len() < FEWEST_ROWS {
+        return Ok(());
+    }
+    if view == View::StateOfCharge {
+        let most = y.iter().fold(0.0_f64, |most, soc| most.max(soc.abs()));
+        if most <= 1.01 {
+            return Err(Failure::Input(format!(
+                "{name}: found values up to {most}, expected per cent, 0 to 100"
+            )));
+        }
+        return Ok(());
+    }
+    let mut volts = y.clone();
+    let mut table: Vec<f64> = base.ocv.iter().map(|(_, volts)| *volts).collect();
+    let (Some(middle), Some(designed)) = (median(&mut volts), median(&mut table)) else {
+        return Ok(());
+    };
+    if let Some(power) = thousands(middle / designed) {
+        return Err(Failure::Input(format!(
+            "{name}: found voltages around {middle:.4}, 10^{} times the open-circuit voltage {designed:.4} V, expected V",
+            3 * power
+        )));
+    }
+    // From one reading to the next the slow open-circuit voltage hardly matters.
+    let steps =
+        |values: &[f64]| -> Vec<f64> { values.windows(2).map(|pair| pair[1] - pair[0]).collect() };
+    let together = correlation(&steps(&x), &steps(&y));
+    if together > -OPPOSITE {
+        return Err(Failure::Input(format!(
+            "{name} rises where {current} rises (correlation {together:.2}): found charging positive, expected discharge \
+             positive; to turn it: --map {current}=-{current}"
+        )));
+    }
+    Ok(())
+}

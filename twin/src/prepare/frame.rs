@@ -1,0 +1,141 @@
+//! A recording under the names of the model file, with its signs.
+
+use std::{collections::HashSet, fs::File, io::Read, ops::Range, path::Path};
+
+use recording::{Error, Mapping, Recording, Table, convert::Format, csv, parquet};
+
+use super::Inputs;
+use crate::{failure::Failure, model::Model};
+
+/// A recording as the model file and `--map` want it seen.
+#[derive(Clone, Debug)]
+pub struct Frame {
+    recording: Recording,
+    /// Names whose sign is turned.
+    negated: HashSet<String>,
+}
+
+impl Frame {
+    /// A recording as it is.
+    pub fn new(recording: Recording) -> Self {
+        Self {
+            recording,
+            negated: HashSet::new(),
+        }
+    }
+
+    /// The file's name.
+    pub fn source(&self) -> &str {
+        self.recording.source()
+    }
+
+    /// Names of the columns.
+    pub fn names(&self) -> Vec<&str> {
+        self.recording.table().names().collect()
+    }
+
+    /// Whether there is such a column.
+    pub fn has(&self, name: &str) -> bool {
+        self.recording.column(name).is_some()
+    }
+
+    /// A column, NaN where a value is missing.
+    pub fn column(&self, name: &str) -> Option<Vec<f64>> {
+        let values = self.recording.column(name)?;
+        if self.negated.contains(name) {
+            return Some(values.iter().map(|value| -value).collect());
+        }
+        Some(values.to_vec())
+    }
+
+    /// A column that must be there.
+    pub fn need(&self, name: &str) -> Result<Vec<f64>, Failure> {
+        self.recording.need(name)?;
+        Ok(self.column(name).unwrap_or_default())
+    }
+
+    /// Time of each row in s.
+    pub fn t_s(&self) -> &[f64] {
+        self.recording.time_s()
+    }
+
+    /// Rows of each clock.
+    pub fn clocks(&self) -> &[Range<usize>] {
+        self.recording.segments()
+    }
+}
+
+/// Reads the recording and, if there is one, the reference.
+pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Frame>), Failure> {
+    let asked = Mapping::parse(inputs.mapping.iter().map(String::as_str))?;
+    let mut wanted: Vec<(String, String)> = asked
+        .pairs()
+        .map(|(name, column)| (name.to_owned(), column.to_owned()))
+        .collect();
+    // --map is said later, so it counts.
+    for (name, column) in &model.columns {
+        if asked.pairs().all(|(known, _)| known != name) {
+            wanted.push((name.clone(), column.clone()));
+        }
+    }
+    let recording = table(&inputs.recording)?;
+    let Some(reference) = &inputs.reference else {
+        return Ok((mapped(recording, &wanted)?, None));
+    };
+    let reference = table(reference)?;
+    // Each name belongs to the file that has its column; to the recording if both do.
+    let (to_reference, rest): (Vec<_>, Vec<_>) = wanted.into_iter().partition(|(name, column)| {
+        let has = |table: &Table| {
+            let plain = column.strip_prefix('-').unwrap_or(column);
+            table.column(column).is_some() || table.column(plain).is_some()
+        };
+        name != "t_s" && has(&reference) && !has(&recording)
+    });
+    let time: Vec<_> = rest
+        .iter()
+        .filter(|(name, _)| name == "t_s")
+        .cloned()
+        .collect();
+    let time = time
+        .into_iter()
+        .filter(|(_, column)| reference.column(column).is_some());
+    let to_reference: Vec<_> = to_reference.into_iter().chain(time).collect();
+    Ok((
+        mapped(recording, &rest)?,
+        Some(mapped(reference, &to_reference)?),
+    ))
+}
+
+/// CSV or Parquet.
+fn table(path: &Path) -> Result<Table, Failure> {
+    let mut start = Vec::new();
+    let reading = |error: std::io::Error| Error::reading(path, &error);
+    File::open(path)
+        .map_err(reading)?
+        .take(4)
+        .read_to_end(&mut start)
+        .map_err(reading)?;
+    Ok(match Format::of(path, &start) {
+        Format::Parquet => parquet::read(path)?.table,
+        _ => csv::read_table(path)?,
+    })
+}
+
+fn mapped(table: Table, wanted: &[(String, String)]) -> Result<Frame, Failure> {
+    let mut mapping = Mapping::new();
+    let mut negated = HashSet::new();
+    for (name, column) in wanted {
+        // A column's own name may begin with a minus.
+        let turned = column
+            .strip_prefix('-')
+            .filter(|_| table.column(column).is_none());
+        if turned.is_some() {
+            negated.insert(name.clone());
+        }
+        mapping.add(name, turned.unwrap_or(column))?;
+    }
+    Ok(Frame {
+        recording: table.mapped(&mapping)?.into_recording()?,
+        negated,
+    })
+}

@@ -1,0 +1,154 @@
+//! Which readings are new, and which are held ones that were read again.
+
+use super::Frame;
+use super::series::median;
+
+/// Share of repeats, while the reference moves, from which a sensor is read more often than it measures.
+const HELD_SHARE: f64 = 0.2;
+/// The reference moves if it changes by this many of the sensor's own steps.
+const MOVING_STEPS: f64 = 2.0;
+
+/// Which rows hold something new.
+#[derive(Clone, Debug)]
+pub struct Freshness {
+    /// True where the value counts as new.
+    pub rows: Vec<bool>,
+    /// Time between two new values, in s, if values are held; else `None`.
+    pub interval_s: Option<f64>,
+}
+
+impl Freshness {
+    /// Every row.
+    pub fn all(rows: usize) -> Self {
+        Self {
+            rows: vec![true; rows],
+            interval_s: None,
+        }
+    }
+}
+
+/// Decides it for one column. `beside` says that the reference has the same rows; without one, changes of the value
+/// have to tell.
+///
+/// `stated_s` is the time between two new readings by design, 0 if nothing is stated.
+///
+/// A sensor that repeats itself at its highest or lowest value, or at one value above all (zero), does not hold: that is
+/// clipping or a dead band.
+pub fn freshness(
+    frame: &Frame,
+    reference: &[f64],
+    value: &[f64],
+    beside: bool,
+    stated_s: f64,
+) -> Freshness {
+    let t_s = frame.t_s();
+    let rows = value.len();
+    // Pairs of successive readings of one clock.
+    let mut pairs = Vec::new();
+    for clock in frame.clocks() {
+        let known: Vec<usize> = clock
+            .clone()
+            .filter(|row| value[*row].is_finite())
+            .collect();
+        pairs.extend(known.windows(2).map(|pair| (pair[0], pair[1])));
+    }
+    let mut steps: Vec<f64> = pairs
+        .iter()
+        .map(|(before, after)| (value[*after] - value[*before]).abs())
+        .filter(|step| *step > 0.0)
+        .collect();
+    steps.sort_by(f64::total_cmp);
+    // The smallest step there is; not the very smallest, which may be rounding.
+    let Some(step) = steps.get(steps.len() / 100).copied() else {
+        return Freshness::all(rows);
+    };
+    let (low, high) = value
+        .iter()
+        .filter(|value| value.is_finite())
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
+            (low.min(*value), high.max(*value))
+        });
+    let favourite = most_repeated(&pairs, value);
+    let moves = |before: usize, after: usize| {
+        if beside {
+            (reference[after] - reference[before]).abs() > MOVING_STEPS * step
+        } else {
+            true
+        }
+    };
+    let (mut moved, mut repeated) = (0_usize, 0_usize);
+    for (before, after) in &pairs {
+        let now = value[*before];
+        let special = now == low || now == high || Some(now) == favourite;
+        if special || !moves(*before, *after) {
+            continue;
+        }
+        moved += 1;
+        repeated += usize::from(value[*before] == value[*after]);
+    }
+    let mut apart: Vec<f64> = pairs
+        .iter()
+        .map(|(before, after)| t_s[*after] - t_s[*before])
+        .collect();
+    let is_stated = median(&mut apart).is_some_and(|step_s| step_s < 0.75 * stated_s);
+    let is_seen = moved >= 10 && repeated as f64 >= HELD_SHARE * moved as f64;
+    if !is_stated && !is_seen {
+        return Freshness::all(rows);
+    }
+    // Time between changes where the reference moved, so that a rest does not look like a slow sensor.
+    let mut last_change: Option<f64> = None;
+    let mut spans = Vec::new();
+    let mut fresh = vec![false; rows];
+    let mut before_row = usize::MAX;
+    for (before, after) in &pairs {
+        if *before != before_row {
+            // The first reading of a clock.
+            fresh[*before] = true;
+            last_change = None;
+        }
+        before_row = *after;
+        if value[*after] != value[*before] {
+            if let Some(since) = last_change {
+                spans.push(t_s[*after] - since);
+            }
+            last_change = Some(t_s[*after]);
+        }
+    }
+    let interval_s = if is_stated {
+        stated_s
+    } else {
+        median(&mut spans).unwrap_or(0.0)
+    };
+    // A value that stays longer was measured again and came out the same: once for each interval.
+    let mut last_fresh = f64::NEG_INFINITY;
+    before_row = usize::MAX;
+    for (before, after) in &pairs {
+        if *before != before_row {
+            last_fresh = t_s[*before];
+        }
+        before_row = *after;
+        let since = t_s[*after] - last_fresh;
+        if value[*after] != value[*before] || since >= 1.5 * interval_s {
+            fresh[*after] = true;
+            last_fresh = t_s[*after];
+        }
+    }
+    Freshness {
+        rows: fresh,
+        interval_s: Some(interval_s),
+    }
+}
+
+/// The value that is repeated most.
+fn most_repeated(pairs: &[(usize, usize)], value: &[f64]) -> Option<f64> {
+    let mut repeats: Vec<f64> = pairs
+        .iter()
+        .filter(|(before, after)| value[*before] == value[*after])
+        .map(|(before, _)| value[*before])
+        .collect();
+    repeats.sort_by(f64::total_cmp);
+    repeats
+        .chunk_by(|one, other| one == other)
+        .max_by_key(|run| run.len())
+        .and_then(|run| run.first().copied())
+}

@@ -1,0 +1,225 @@
+//! Rows of drive and observation.
+
+use std::ops::Range;
+
+use super::Frame;
+use crate::problem::{Drive, Observed};
+
+/// A step is a gap if it is longer than this many median steps, …
+const GAP_STEPS: f64 = 10.0;
+/// … than this, in s, …
+const SHORTEST_GAP_S: f64 = 5.0;
+/// … and than this many times either neighbouring step: a logger that slows down in a rest leaves no gap.
+const GAP_OF_NEIGHBOURS: f64 = 10.0;
+
+/// A drive and where its rows are from.
+#[derive(Clone, Debug)]
+pub(super) struct DriveParts {
+    /// Time, reference and segments; no environment yet.
+    pub drive: Drive,
+    /// Row of the frame that each row is from.
+    pub rows: Vec<usize>,
+    /// Clock of each segment, as an index into [`Frame::clocks`].
+    pub clocks: Vec<usize>,
+}
+
+/// The rows that have a reference, in segments.
+pub(super) fn drive(frame: &Frame, reference: &[f64]) -> DriveParts {
+    let time_s = frame.t_s();
+    let mut parts = DriveParts {
+        drive: Drive::default(),
+        rows: Vec::new(),
+        clocks: Vec::new(),
+    };
+    for (clock, rows) in frame.clocks().iter().enumerate() {
+        let known: Vec<usize> = rows
+            .clone()
+            .filter(|row| reference[*row].is_finite())
+            .collect();
+        let t_s: Vec<f64> = known.iter().map(|row| time_s[*row]).collect();
+        let first = parts.rows.len();
+        let mut start = first;
+        let mut continues = false;
+        for cut in gaps(&t_s).into_iter().chain([known.len()]) {
+            let end = first + cut;
+            if end > start {
+                parts.drive.segments.push(start..end);
+                parts.drive.continues.push(continues);
+                parts.clocks.push(clock);
+                continues = true;
+            }
+            start = end;
+        }
+        parts
+            .drive
+            .reference
+            .extend(known.iter().map(|row| reference[*row]));
+        parts.drive.t_s.extend(t_s);
+        parts.rows.extend(known);
+    }
+    parts
+}
+
+/// Rows before which there is a gap.
+fn gaps(t_s: &[f64]) -> Vec<usize> {
+    let steps: Vec<f64> = t_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    let mut sorted: Vec<f64> = steps.iter().copied().filter(|step| *step > 0.0).collect();
+    if sorted.is_empty() {
+        return Vec::new();
+    }
+    let middle = sorted.len() / 2;
+    let median = *sorted.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let least = (GAP_STEPS * median).max(SHORTEST_GAP_S);
+    let is_gap = |index: usize| {
+        let step = steps[index];
+        let before = index.checked_sub(1).map_or(0.0, |before| steps[before]);
+        let after = steps.get(index + 1).copied().unwrap_or(0.0);
+        step > least && step > GAP_OF_NEIGHBOURS * before.max(after)
+    };
+    (0..steps.len())
+        .filter(|index| is_gap(*index))
+        .map(|index| index + 1)
+        .collect()
+}
+
+/// Whether each row with a reading has a reference as well.
+pub(super) fn share_rows(rows: &[usize], value: &[f64]) -> bool {
+    let in_drive = rows.iter().filter(|row| value[**row].is_finite()).count();
+    in_drive == value.iter().filter(|value| value.is_finite()).count()
+}
+
+/// An observation on the drive's own rows.
+pub(super) fn drive_rows(
+    drive: &Drive,
+    rows: &[usize],
+    value: &[f64],
+    fresh: &[bool],
+) -> (Observed, Vec<usize>) {
+    let taken: Vec<f64> = rows.iter().map(|row| value[*row]).collect();
+    let observed = Observed {
+        t_s: drive.t_s.clone(),
+        valid: rows
+            .iter()
+            .zip(&taken)
+            .map(|(row, value)| value.is_finite() && fresh[*row])
+            .collect(),
+        value: taken,
+        segment: segments_of(drive),
+        on_drive_rows: true,
+    };
+    (observed, rows.to_vec())
+}
+
+/// The rows of the drive, with nothing observed.
+pub(super) fn every_row(drive: &Drive, rows: &[usize]) -> (Observed, Vec<usize>) {
+    let observed = Observed {
+        t_s: drive.t_s.clone(),
+        value: vec![f64::NAN; drive.len()],
+        valid: vec![true; drive.len()],
+        segment: segments_of(drive),
+        on_drive_rows: true,
+    };
+    (observed, rows.to_vec())
+}
+
+fn segments_of(drive: &Drive) -> Vec<usize> {
+    let mut segments = vec![0; drive.len()];
+    for (index, rows) in drive.segments.iter().enumerate() {
+        segments[rows.clone()].fill(index);
+    }
+    segments
+}
+
+/// An observation on rows of its own: those that have a reading. `sensor_clocks` are the sensor's clocks, each the same
+/// as the drive's of the same index.
+pub(super) fn own_rows(
+    drive: &Drive,
+    clocks: &[usize],
+    sensor_clocks: &[Range<usize>],
+    t_s: &[f64],
+    value: &[f64],
+    fresh: &[bool],
+) -> (Observed, Vec<usize>) {
+    let mut observed = Observed::default();
+    let mut rows = Vec::new();
+    for (clock, own) in sensor_clocks.iter().enumerate() {
+        let segments: Vec<usize> = (0..clocks.len())
+            .filter(|index| clocks[*index] == clock)
+            .collect();
+        if segments.is_empty() {
+            continue;
+        }
+        let mut at = 0;
+        for row in own.clone().filter(|row| value[*row].is_finite()) {
+            let now_s = t_s[row];
+            let begins = |index: usize| drive.t_s[drive.segments[segments[index]].start];
+            while at + 1 < segments.len() && begins(at + 1) <= now_s {
+                at += 1;
+            }
+            let inside = &drive.segments[segments[at]];
+            let covered = drive.t_s[inside.start] <= now_s && now_s <= drive.t_s[inside.end - 1];
+            observed.t_s.push(now_s);
+            observed.value.push(value[row]);
+            observed.valid.push(covered && fresh[row]);
+            observed.segment.push(segments[at]);
+            rows.push(row);
+        }
+    }
+    (observed, rows)
+}
+
+/// Median time between readings that count, in s; 0 with fewer than two.
+pub(super) fn spacing_s(observed: &Observed) -> f64 {
+    let mut last: Option<(usize, f64)> = None;
+    let mut steps = Vec::new();
+    for row in (0..observed.t_s.len()).filter(|row| observed.valid[*row]) {
+        let (segment, now_s) = (observed.segment[row], observed.t_s[row]);
+        if let Some((before, before_s)) = last
+            && before == segment
+            && now_s > before_s
+        {
+            steps.push(now_s - before_s);
+        }
+        last = Some((segment, now_s));
+    }
+    median(&mut steps).unwrap_or(0.0)
+}
+
+/// The middle one.
+pub(super) fn median(values: &mut [f64]) -> Option<f64> {
+    if values.is_empty() {
+        return None;
+    }
+    let middle = values.len() / 2;
+    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// Surroundings change slowly: a missing value is the last one, at the start the first one. `None` if there is none.
+pub(super) fn held_over_gaps(values: impl Iterator<Item = f64>) -> Option<Vec<f64>> {
+    let mut values: Vec<f64> = values.collect();
+    let mut last = values.iter().copied().find(|value| value.is_finite())?;
+    for value in &mut values {
+        if value.is_finite() {
+            last = *value;
+        } else {
+            *value = last;
+        }
+    }
+    Some(values)
+}
+
+/// The same from rows with another time: the last value at or before each of `wanted`.
+pub(super) fn held_at(t_s: &[f64], values: &[f64], wanted: &[f64]) -> Option<Vec<f64>> {
+    let mut last = values.iter().copied().find(|value| value.is_finite())?;
+    let mut at = 0;
+    let held = wanted.iter().map(|now_s| {
+        while at < t_s.len() && t_s[at] <= *now_s {
+            if values[at].is_finite() {
+                last = values[at];
+            }
+            at += 1;
+        }
+        last
+    });
+    Some(held.collect())
+}

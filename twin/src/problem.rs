@@ -1,0 +1,191 @@
+//! What the stages hand on: what drives the simulation, what was observed, and what the design says about it.
+//!
+//! Recording and model file become one [`Problem`] for each signal that can be compared. Everything after that
+//! (location, effects, selection) knows nothing of files.
+
+use std::ops::Range;
+
+/// A signal that is compared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum View {
+    /// A current, power or any other quantity that a sensor reads, against its reference; in the sensor's unit.
+    Sensor,
+    /// The mean current between two readings of the charge counter, in A: the counter's differences over time.
+    Charge,
+    /// State of charge, in %.
+    StateOfCharge,
+    /// Voltage of a cell or pack, in V.
+    Voltage,
+}
+
+/// The drive: the reference and the environment, on the reference's own time stamps. All series have the same length.
+#[derive(Clone, Debug, Default)]
+pub struct Drive {
+    /// Time in s, finite, non-decreasing within each segment.
+    pub t_s: Vec<f64>,
+    /// The reference quantity, in the view's unit; for battery views the current in A, positive = discharge. Finite: rows
+    /// without a reference are not part of the drive.
+    pub reference: Vec<f64>,
+    /// Temperature of the sensor in °C, held over gaps; `None` where it was not recorded.
+    pub sensor_temperature_c: Option<Vec<f64>>,
+    /// Supply of the sensor in V.
+    pub supply_v: Option<Vec<f64>>,
+    /// Current of the neighbouring conductor in A.
+    pub aux_a: Option<Vec<f64>>,
+    /// Range flag: 1 where the large range measures.
+    pub range_high: Option<Vec<f64>>,
+    /// Temperature of the cell in °C.
+    pub cell_temperature_c: Option<Vec<f64>>,
+    /// Temperature of the surroundings in °C.
+    pub ambient_c: Option<Vec<f64>>,
+    /// Stretches with one clock and no gap; states (filters, charge) start anew in each, except where
+    /// [`Drive::continues`] says that the clock goes on.
+    pub segments: Vec<Range<usize>>,
+    /// True where the segment of the same index continues the charge of the one before (a gap, not a new operation).
+    pub continues: Vec<bool>,
+}
+
+/// What was recorded of the signal under test.
+#[derive(Clone, Debug, Default)]
+pub struct Observed {
+    /// Time in s on the sensor's own clock; when reference and sensor share rows, the drive's time.
+    pub t_s: Vec<f64>,
+    /// The reading; NaN where there is none.
+    pub value: Vec<f64>,
+    /// True where the reading counts: present, not a repeat of a held value, not in a drop-out, within the drive's time.
+    pub valid: Vec<bool>,
+    /// Index of the drive's segment that the row belongs to.
+    pub segment: Vec<usize>,
+    /// True if row `k` of the observation is row `k` of the drive (same time stamps): no interpolation then.
+    pub on_drive_rows: bool,
+}
+
+/// What the simulation as designed says, at each observed row, and what it needs to be run again with effects.
+#[derive(Clone, Debug)]
+pub enum Base {
+    /// A sensor that reads its reference.
+    Sensor(SensorBase),
+    /// A battery's state of charge or voltage.
+    Battery(BatteryBase),
+}
+
+/// A sensor as designed.
+#[derive(Clone, Debug, Default)]
+pub struct SensorBase {
+    /// What the sensor as designed would have read at each observed row, with effects of the model file already in it;
+    /// empty: its reference, through [`SensorBase::window_s`].
+    pub reading: Vec<f64>,
+    /// Averaging window by design, in s; 0: none.
+    pub window_s: f64,
+    /// The converter's step by design, in the view's unit; 0: continuous.
+    pub step: f64,
+    /// Time by which readings stand for an earlier moment than their row, within half a step; found with an effect, 0 by design.
+    pub alignment_s: f64,
+    /// Full scale, in the view's unit, if stated.
+    pub full_scale: Option<f64>,
+    /// Full scale of the large range over that of the small one; 0 if there is one range.
+    pub range_ratio: f64,
+    /// Where the small range ends by design, in the view's unit, if there are two.
+    pub range_limit: Option<f64>,
+    /// True if the reference stays at its value until its next row instead of going there in a straight line.
+    pub held_reference: bool,
+}
+
+/// A battery as designed: open-circuit voltage and ohmic resistance.
+#[derive(Clone, Debug, Default)]
+pub struct BatteryBase {
+    /// Capacity in Ah.
+    pub capacity_ah: f64,
+    /// Coulombic efficiency by design, 1 if not stated.
+    pub efficiency: f64,
+    /// State of charge at the start of each segment, 0 … 1.
+    pub initial_soc: Vec<f64>,
+    /// Standard uncertainty of [`BatteryBase::initial_soc`], 0 … 1; 0: exact.
+    pub initial_soc_sigma: f64,
+    /// Open-circuit voltage of the whole series string: state of charge (ascending) and V.
+    pub ocv: Vec<(f64, f64)>,
+    /// Ohmic resistance at 25 °C, in Ω, of the whole string.
+    pub resistance_ohm: f64,
+    /// Relative standard uncertainty of [`BatteryBase::resistance_ohm`]; 0: exact.
+    pub resistance_sigma: f64,
+}
+
+/// A comparison of one signal: the input of every later stage.
+#[derive(Clone, Debug)]
+pub struct Problem {
+    /// Which signal.
+    pub view: View,
+    /// Its column, such as `i_meas_a`.
+    pub name: String,
+    /// Its unit, such as `A`.
+    pub unit: String,
+    /// What drives it.
+    pub drive: Drive,
+    /// What was recorded.
+    pub observed: Observed,
+    /// The simulation as designed.
+    pub base: Base,
+    /// Effects that the model file already holds: id and values in the order of the effect's parameters.
+    pub modelled: Vec<(&'static str, Vec<f64>)>,
+    /// Standard deviation of the noise that the design specifies for one reading (white and quantisation), in the view's unit;
+    /// 0 if nothing is stated.
+    pub noise: f64,
+    /// Accuracy of the reference instrument, in the view's unit: a constant part and a share of the reading.
+    pub accuracy: Accuracy,
+}
+
+/// Accuracy of an instrument: `zero + gain·abs(reading)`.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Accuracy {
+    /// Constant part, in the view's unit.
+    pub zero: f64,
+    /// Share of the reading.
+    pub gain: f64,
+}
+
+impl Drive {
+    /// Number of rows.
+    pub fn len(&self) -> usize {
+        self.t_s.len()
+    }
+
+    /// True without rows.
+    pub fn is_empty(&self) -> bool {
+        self.t_s.is_empty()
+    }
+
+    /// Median step in s over all segments; 0 with fewer than two rows.
+    pub fn median_step_s(&self) -> f64 {
+        let mut steps: Vec<f64> = self
+            .segments
+            .iter()
+            .flat_map(|rows| {
+                self.t_s[rows.clone()]
+                    .windows(2)
+                    .map(|pair| pair[1] - pair[0])
+            })
+            .filter(|step| *step > 0.0)
+            .collect();
+        if steps.is_empty() {
+            return 0.0;
+        }
+        let middle = steps.len() / 2;
+        *steps.select_nth_unstable_by(middle, f64::total_cmp).1
+    }
+
+    /// Time covered, in s.
+    pub fn span_s(&self) -> f64 {
+        self.segments
+            .iter()
+            .filter(|rows| !rows.is_empty())
+            .map(|rows| self.t_s[rows.end - 1] - self.t_s[rows.start])
+            .sum()
+    }
+}
+
+impl Observed {
+    /// Rows that count.
+    pub fn valid_rows(&self) -> usize {
+        self.valid.iter().filter(|valid| **valid).count()
+    }
+}

@@ -1,0 +1,166 @@
+//! `twin simulate`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use recording::{Table, convert};
+
+use super::board::Board;
+use crate::{
+    explain,
+    failure::Failure,
+    model::Model,
+    prepare::{Inputs, Item, Prepared, Purpose, prepare},
+    problem::{Base, View},
+    progress::Progress,
+};
+
+/// What an example of its use looks like.
+const EXAMPLE: &str = "\
+Example:
+  twin simulate --model board.toml --recording drive.csv --out simulated.csv
+
+Writes t_s and, under the names of the recording, what the sensor, its charge counter and the battery of the model would
+have reported: as designed, and with the effects that the model file holds. docs/model-file.md describes the model file.";
+
+/// Writes what the board as designed would have reported.
+#[derive(Args, Clone, Debug)]
+#[command(after_help = EXAMPLE)]
+pub struct Arguments {
+    /// What the simulation knows (TOML).
+    #[arg(long, value_name = "FILE")]
+    model: PathBuf,
+    /// The recording that drives it, as CSV or Parquet.
+    #[arg(long, value_name = "FILE")]
+    recording: PathBuf,
+    /// The reference, if another instrument logged it on its own clock.
+    #[arg(long, value_name = "FILE")]
+    reference: Option<PathBuf>,
+    /// The file to write; its ending says the format: .csv or .parquet.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Calls a column by another name; a minus before the column turns its sign.
+    #[arg(long, value_name = "NAME=COLUMN", allow_hyphen_values = true)]
+    map: Vec<String>,
+}
+
+/// Simulates, and says in a few lines what was written.
+pub fn run(arguments: &Arguments) -> Result<String, Failure> {
+    convert::is_parquet(&arguments.out)?;
+    let model = Model::read(&arguments.model)?;
+    let inputs = Inputs {
+        recording: arguments.recording.clone(),
+        reference: arguments.reference.clone(),
+        mapping: arguments.map.clone(),
+    };
+    let progress = Progress::new(format!("simulating {}", arguments.recording.display()));
+    let prepared = prepare(&model, &inputs, Purpose::Simulate)?;
+    let columns = columns(&model, &prepared);
+    drop(progress);
+    let table = Table::new(arguments.out.display().to_string(), columns)?;
+    let mut writing = Progress::new(format!("writing {}", arguments.out.display()));
+    convert::write(&arguments.out, &table, &mut |share| writing.at(share))?;
+    drop(writing);
+    if !arguments.out.is_file() {
+        return Ok(String::new());
+    }
+    let names: Vec<&str> = table.names().skip(1).collect();
+    let mut text = format!(
+        "{}: {} rows of {} from {}",
+        arguments.out.display(),
+        table.len(),
+        names.join(", "),
+        arguments.recording.display()
+    );
+    for remark in &prepared.remarks {
+        text.push_str(&format!("\n{remark}"));
+    }
+    Ok(text)
+}
+
+/// Time and the simulated signals, one row for each of the recording.
+pub fn columns(model: &Model, prepared: &Prepared) -> Vec<(String, Vec<f64>)> {
+    let rows = prepared.t_s.len();
+    let mut columns = vec![("t_s".to_owned(), prepared.t_s.clone())];
+    let mut add = |name: &str, from: &[usize], values: &[f64]| {
+        if columns.iter().any(|(known, _)| known == name) {
+            return;
+        }
+        let mut column = vec![f64::NAN; rows];
+        for (row, value) in from.iter().zip(values) {
+            column[*row] = *value;
+        }
+        columns.push((name.to_owned(), column));
+    };
+    for item in &prepared.items {
+        match item.problem.view {
+            View::Charge => {}
+            _ => add(&item.problem.name, &item.rows, &predicted(item)),
+        }
+    }
+    let sensor = prepared
+        .items
+        .iter()
+        .find(|item| item.problem.view == View::Sensor);
+    if let (Some(item), Some(charge)) = (sensor, counter(model, prepared)) {
+        let name = model
+            .charge
+            .as_ref()
+            .and_then(|charge| charge.column.clone());
+        add(name.as_deref().unwrap_or("q_meas_c"), &item.rows, &charge);
+    }
+    columns
+}
+
+/// What the simulation says at each observed row, with the effects of the model file: the one place where they are
+/// applied.
+pub fn predicted(item: &Item) -> Vec<f64> {
+    let problem = &item.problem;
+    if problem.modelled.is_empty() {
+        super::designed(problem)
+    } else {
+        explain::predict(problem, &[])
+    }
+}
+
+/// The charge counter, in C: the board's meter as designed, or the sum of the sensor's readings for a pair that says it
+/// has a counter.
+fn counter(model: &Model, prepared: &Prepared) -> Option<Vec<f64>> {
+    let item = prepared
+        .items
+        .iter()
+        .find(|item| item.problem.view == View::Sensor)?;
+    let sensor = model.sensor.as_ref()?;
+    let problem = &item.problem;
+    if problem.unit != "A" {
+        return None;
+    }
+    if let Some(board) = Board::new(sensor.front_end, sensor.average.unwrap_or(1)) {
+        let held = matches!(&problem.base, Base::Sensor(base) if base.held_reference);
+        return Some(
+            board
+                .run(&problem.drive, held, &problem.observed, item.pace, true)
+                .charge_c,
+        );
+    }
+    let charge = model.charge.as_ref()?;
+    let current = predicted(item);
+    let mut sum = 0.0;
+    let step = charge.step_c;
+    let counted = (0..current.len()).map(|row| {
+        let observed = &problem.observed;
+        if row > 0 && observed.segment[row] == observed.segment[row - 1] {
+            let h = observed.t_s[row] - observed.t_s[row - 1];
+            let mean = 0.5 * (current[row] + current[row - 1]);
+            if mean.is_finite() {
+                sum += mean * h;
+            }
+        }
+        if step > 0.0 {
+            (sum / step).floor() * step
+        } else {
+            sum
+        }
+    });
+    Some(counted.collect())
+}

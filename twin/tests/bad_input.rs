@@ -1,0 +1,334 @@
+//! Bad input: one clear sentence that says where, what and what was expected; exit code 2; nothing left behind.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::{fs, path::Path, process::Command};
+
+const PAIR: &str = "schema = 1\n[sensor]\n";
+
+fn rows(count: usize, mut row: impl FnMut(f64) -> String) -> String {
+    (0..count).map(|k| row(k as f64 * 0.1) + "\n").collect()
+}
+
+fn current(t: f64) -> f64 {
+    10.0 * (0.37 * t).sin() + 3.0 * (1.91 * t).sin() + 1.0
+}
+
+fn good() -> String {
+    "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| format!("{t},{},{}", current(t), current(t) + 0.5))
+}
+
+/// Runs a command in a folder with these files; its sentence. Nothing may be left beside them.
+fn refused(files: &[(&str, &str)], arguments: &[&str]) -> String {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, content) in files {
+        fs::write(folder.path().join(name), content).unwrap();
+    }
+    let before = names(folder.path());
+    let output = Command::new(env!("CARGO_BIN_EXE_twin"))
+        .args(arguments)
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    let sentence = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(2), "{sentence}");
+    assert!(output.stdout.is_empty());
+    assert_eq!(names(folder.path()), before);
+    assert!(sentence.starts_with("error: "), "{sentence}");
+    assert_eq!(sentence.trim_end().lines().count(), 1, "{sentence}");
+    sentence
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> = fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    names.sort();
+    names
+}
+
+fn explained(model: &str, recording: &str) -> String {
+    refused(
+        &[("m.toml", model), ("r.csv", recording)],
+        &[
+            "explain",
+            "--model",
+            "m.toml",
+            "--recording",
+            "r.csv",
+            "--out",
+            "out",
+        ],
+    )
+}
+
+fn says(sentence: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(sentence.contains(part), "no {part} in: {sentence}");
+    }
+}
+
+#[test]
+fn two_units() {
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| {
+            format!("{t},{},{}", 1000.0 * current(t), current(t))
+        });
+    says(
+        &explained(PAIR, &recording),
+        &["i_ref_a", "i_meas_a", "factor near 1000", "same unit"],
+    );
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| format!("{t},{},{}", current(t), 1e6 * current(t)));
+    says(&explained(PAIR, &recording), &["factor near 1000000"]);
+}
+
+#[test]
+fn opposite_signs() {
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| format!("{t},{},{}", current(t), -current(t)));
+    let sentence = explained(PAIR, &recording);
+    says(
+        &sentence,
+        &[
+            "i_meas_a falls where i_ref_a rises",
+            "--map i_meas_a=-i_meas_a",
+        ],
+    );
+}
+
+#[test]
+fn the_proposed_mapping_is_taken() {
+    let folder = tempfile::tempdir().unwrap();
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| format!("{t},{},{}", current(t), -current(t)));
+    fs::write(folder.path().join("m.toml"), PAIR).unwrap();
+    fs::write(folder.path().join("r.csv"), recording).unwrap();
+    let output = Command::new(env!("CARGO_BIN_EXE_twin"))
+        .args([
+            "simulate",
+            "--model",
+            "m.toml",
+            "--recording",
+            "r.csv",
+            "--out",
+            "s.csv",
+        ])
+        .args(["--map", "i_meas_a=-i_meas_a"])
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(0), "{output:?}");
+}
+
+#[test]
+fn a_reference_of_another_time() {
+    // In one file: the reference ends before the sensor begins.
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| format!("{t},{},", current(t)))
+        + &rows(300, |t| format!("{},,{}", t + 100.0, current(t)));
+    says(
+        &explained(PAIR, &recording),
+        &["i_meas_a", "100 … 129.9 s", "0 … 29.9 s", "same time"],
+    );
+    // In two files: nothing in common. The second is no shifted or scaled copy of the first.
+    let reference =
+        "t_s,i_ref_a\n".to_owned() + &rows(600, |t| format!("{t},{}", (0.05 * t * t).sin()));
+    let mut state = 1_u32;
+    let mut noise = move || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        f64::from(state >> 8) / f64::from(1 << 24)
+    };
+    let sensor =
+        "t_s,i_meas_a\n".to_owned() + &rows(600, |t| format!("{},{}", t + 5000.0, noise()));
+    let sentence = refused(
+        &[
+            ("m.toml", PAIR),
+            ("r.csv", &sensor),
+            ("ref.csv", &reference),
+        ],
+        &[
+            "explain",
+            "--model",
+            "m.toml",
+            "--recording",
+            "r.csv",
+            "--reference",
+            "ref.csv",
+            "--out",
+            "out",
+        ],
+    );
+    says(&sentence, &["ref.csv", "r.csv", "overlap in time"]);
+}
+
+#[test]
+fn a_column_that_never_moves() {
+    let recording =
+        "t_s,i_ref_a,i_meas_a\n".to_owned() + &rows(300, |t| format!("{t},{},3.5", current(t)));
+    says(
+        &explained(PAIR, &recording),
+        &["r.csv", "i_meas_a", "3.5 in every row", "moves"],
+    );
+    let recording =
+        "t_s,i_ref_a,i_meas_a\n".to_owned() + &rows(300, |t| format!("{t},2,{}", current(t)));
+    says(
+        &explained(PAIR, &recording),
+        &["r.csv", "i_ref_a", "2 in every row"],
+    );
+    let recording =
+        "t_s,i_ref_a,i_meas_a\n".to_owned() + &rows(300, |t| format!("{t},{},", current(t)));
+    says(
+        &explained(PAIR, &recording),
+        &["r.csv", "i_meas_a", "no value"],
+    );
+}
+
+#[test]
+fn too_few_rows() {
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(20, |t| format!("{t},{},{}", current(t), current(t) + 0.5));
+    says(
+        &explained(PAIR, &recording),
+        &["r.csv", "i_meas_a", "20 readings", "at least 50"],
+    );
+}
+
+#[test]
+fn an_unknown_key() {
+    let sentence = explained("schema = 1\n[sensor]\nfullscale = 600\n", &good());
+    says(&sentence, &["m.toml, line 3", "fullscale", "`full_scale`"]);
+}
+
+#[test]
+fn a_missing_column() {
+    let recording = good().replacen("i_meas_a", "board", 1);
+    says(
+        &explained(PAIR, &recording),
+        &["r.csv", "t_s, i_ref_a, board", "i_meas_a"],
+    );
+    let recording = good().replacen("i_ref_a", "shunt", 1);
+    says(&explained(PAIR, &recording), &["r.csv", "shunt", "i_ref_a"]);
+    let battery = "schema = 1\n[battery]\ncapacity_ah = 2\nocv = [[0, 3.0], [1, 4.0]]\n";
+    says(
+        &explained(battery, &good()),
+        &["r.csv", "soc_pct, v_cell_v or v_pack_v", "--map"],
+    );
+}
+
+#[test]
+fn a_battery_in_other_units_or_signs() {
+    let battery = "schema = 1\n[battery]\ncapacity_ah = 2\nocv = [[0, 3.0], [1, 4.0]]\nohmic_resistance_ohm = 0.1\n";
+    let recording = |volts: &dyn Fn(f64) -> f64| {
+        "t_s,i_ref_a,v_cell_v\n".to_owned()
+            + &rows(300, |t| format!("{t},{},{}", current(t), volts(current(t))))
+    };
+    says(
+        &explained(battery, &recording(&|i| 3700.0 - 100.0 * i)),
+        &["v_cell_v", "10^3", "expected V"],
+    );
+    let sentence = explained(battery, &recording(&|i| 3.7 + 0.1 * i));
+    says(
+        &sentence,
+        &[
+            "v_cell_v rises where i_ref_a rises",
+            "--map i_ref_a=-i_ref_a",
+        ],
+    );
+    let recording = "t_s,i_ref_a,soc_pct\n".to_owned()
+        + &rows(300, |t| format!("{t},{},{}", current(t), 0.9 - 1e-3 * t));
+    says(&explained(battery, &recording), &["soc_pct", "per cent"]);
+}
+
+#[test]
+fn files_that_are_not_there_and_effects_that_do_not_exist() {
+    let files: [(&str, &str); 2] = [("m.toml", PAIR), ("r.csv", &good())];
+    let base = [
+        "explain",
+        "--model",
+        "m.toml",
+        "--recording",
+        "r.csv",
+        "--out",
+    ];
+    let with =
+        |more: &[&'static str]| -> Vec<&'static str> { base.iter().chain(more).copied().collect() };
+    says(
+        &refused(&files, &with(&["out", "--without", "ofset"])),
+        &["ofset", "offset, gain"],
+    );
+    says(&refused(&files, &with(&["m.toml"])), &["m.toml", "folder"]);
+    says(
+        &refused(&files, &with(&["out", "--holdout", "no.csv"])),
+        &["no.csv", "no such file"],
+    );
+    says(
+        &refused(&files, &with(&["out", "--map", "i_ref_a=shunt"])),
+        &["shunt"],
+    );
+    let simulate = [
+        "simulate",
+        "--model",
+        "no.toml",
+        "--recording",
+        "r.csv",
+        "--out",
+        "s.csv",
+    ];
+    says(&refused(&files, &simulate), &["no.toml", "no such file"]);
+    let simulate = [
+        "simulate",
+        "--model",
+        "m.toml",
+        "--recording",
+        "r.csv",
+        "--out",
+        "s.txt",
+    ];
+    says(&refused(&files, &simulate), &["s.txt", ".csv or .parquet"]);
+}
+
+#[test]
+fn an_implausible_reference_is_said_to_be_one() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(
+        folder.path().join("m.toml"),
+        "schema = 1\n[sensor]\nfull_scale = 15\n",
+    )
+    .unwrap();
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(400, |t| {
+            // Stuck for 6 s, with one spike.
+            let reference = match t {
+                t if (10.0..16.0).contains(&t) => 2.0,
+                t if (t - 25.0).abs() < 0.01 => 90.0,
+                t => current(t),
+            };
+            format!("{t},{reference},{}", current(t))
+        });
+    fs::write(folder.path().join("r.csv"), recording).unwrap();
+    let output = Command::new(env!("CARGO_BIN_EXE_twin"))
+        .args([
+            "explain",
+            "--model",
+            "m.toml",
+            "--recording",
+            "r.csv",
+            "--out",
+            "out",
+        ])
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(0), "{output:?}");
+    let report = fs::read_to_string(folder.path().join("out/report.json")).unwrap();
+    says(
+        &report,
+        &["stands at 2", "jumps there and back", "full scale of 15"],
+    );
+    let mut written = names(&folder.path().join("out"));
+    written.sort();
+    assert_eq!(written, ["model.toml", "report.html", "report.json"]);
+}

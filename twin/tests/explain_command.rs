@@ -1,0 +1,190 @@
+//! `twin explain` and `twin effects` as they are called.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::{
+    fs,
+    path::Path,
+    process::{Command, Output},
+};
+
+use rand_chacha::{
+    ChaCha8Rng,
+    rand_core::{Rng, SeedableRng},
+};
+use twin::model::Model;
+
+const BOARD: &str =
+    "# My car.\nschema = 1\n\n[sensor]\nfront_end = \"hah1bv\"\nnoise = 0.05 # as measured\n";
+
+fn twin(folder: &Path, arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_twin"))
+        .args(arguments)
+        .current_dir(folder)
+        .output()
+        .unwrap()
+}
+
+/// A drive, and what the simulated board reads with a gain and an offset that the model lacks, and with noise.
+fn recording(folder: &Path, seed: u64) {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut uniform = move || f64::from(random.next_u32()) / f64::from(u32::MAX);
+    let (mut current, mut target, mut left) = (0.0, 0.0, 0);
+    let mut drive = "t_s,i_ref_a\n".to_owned();
+    // As frames come: each 10 ms, a new reading in each third.
+    for k in 0..20_000 {
+        if left == 0 {
+            left = 100 + (700.0 * uniform()) as u32;
+            target = if uniform() < 0.2 {
+                0.0
+            } else {
+                250.0 * uniform() - 100.0
+            };
+        }
+        left -= 1;
+        current += 0.02 * (target - current);
+        drive.push_str(&format!("{},{current}\n", f64::from(k) / 100.0));
+    }
+    fs::write(folder.join("drive.csv"), drive).unwrap();
+    let truth = format!("{BOARD}[effects.offset]\noffset_a = 1.5\n[effects.gain]\ngain = 1.02\n");
+    fs::write(folder.join("truth.toml"), truth).unwrap();
+    let arguments = [
+        "simulate",
+        "--model",
+        "truth.toml",
+        "--recording",
+        "drive.csv",
+        "--out",
+        "simulated.csv",
+    ];
+    assert_eq!(twin(folder, &arguments).status.code(), Some(0));
+    let read = |name: &str, column: &str| -> Vec<f64> {
+        let recording = recording::csv::read(&folder.join(name)).unwrap();
+        recording.column(column).unwrap().to_vec()
+    };
+    let (reference, simulated) = (
+        read("drive.csv", "i_ref_a"),
+        read("simulated.csv", "i_meas_a"),
+    );
+    let mut text = "t_s,i_ref_a,i_meas_a\n".to_owned();
+    let (mut last, mut noise) = (f64::NAN, 0.0);
+    for (row, (reference, reading)) in reference.iter().zip(&simulated).enumerate() {
+        if *reading != last {
+            (last, noise) = (*reading, 0.17 * (uniform() - 0.5));
+        }
+        text.push_str(&format!(
+            "{},{reference},{}\n",
+            row as f64 / 100.0,
+            reading + noise
+        ));
+    }
+    fs::write(folder.join(format!("r{seed}.csv")), text).unwrap();
+}
+
+#[test]
+fn writes_report_page_model_and_calibration() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    fs::write(folder.join("m.toml"), BOARD).unwrap();
+    recording(folder, 1);
+    recording(folder, 2);
+    let arguments = |out: &'static str| {
+        [
+            "explain",
+            "--model",
+            "m.toml",
+            "--recording",
+            "r1.csv",
+            "--holdout",
+            "r2.csv",
+            "--out",
+            out,
+        ]
+    };
+    let output = twin(folder, &arguments("out"));
+    let summary = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{summary}");
+    assert!(summary.lines().count() <= 24, "{summary}");
+    let read = |name: &str| fs::read_to_string(folder.join("out").join(name)).unwrap();
+    let report: serde_json::Value = serde_json::from_str(&read("report.json")).unwrap();
+    assert_eq!(report["schema"], 1);
+    assert_eq!(report["inputs"]["recording"], "r1.csv");
+    assert_eq!(report["holdouts"][0]["file"], "r2.csv");
+    assert!(read("report.html").starts_with("<!DOCTYPE html>"));
+    // The model is its user's file, with what was found.
+    let text = read("model.toml");
+    assert!(text.starts_with(BOARD), "{text}");
+    let model = Model::read(&folder.join("out/model.toml")).unwrap();
+    let found = |id: &str| {
+        model
+            .effects
+            .iter()
+            .find(|(known, _)| *known == id)
+            .unwrap_or_else(|| panic!("no {id}: {summary}"))
+            .1[0]
+    };
+    assert!((found("gain") - 1.02).abs() < 0.002, "{text}");
+    assert!((found("offset") - 1.5).abs() < 0.1, "{text}");
+    // The board is told what takes it out again: (1 + gain)·1.02·(i + 1.5) − drift = i.
+    let calibration: toml::Table = read("calibration.toml").parse().unwrap();
+    let registers = calibration["register"].as_array().unwrap();
+    let value = |name: &str| {
+        let register = registers
+            .iter()
+            .find(|register| register["name"].as_str() == Some(name))
+            .unwrap();
+        register["small"].as_integer().unwrap() as f64
+    };
+    assert!((value("current gain") - (1.0 / 1.02 - 1.0) * 1e6).abs() < 2000.0);
+    assert!((value("zero drift") - 1.5e6).abs() < 5e4);
+    // The extended model needs no more than its own file: what it leaves is the noise that it states, as the report
+    // showed, but for the alignment within a step of the rows, which is no part of the model.
+    let arguments = [
+        "explain",
+        "--model",
+        "out/model.toml",
+        "--recording",
+        "r1.csv",
+        "--out",
+        "again",
+    ];
+    assert_eq!(twin(folder, &arguments).status.code(), Some(0));
+    let again = fs::read_to_string(folder.join("again/report.json")).unwrap();
+    let again: serde_json::Value = serde_json::from_str(&again).unwrap();
+    let figure =
+        |report: &serde_json::Value, name: &str| report["signals"][0][name].as_f64().unwrap();
+    let kept = figure(&again, "rmse_before");
+    assert!(figure(&report, "rmse_after") < 0.067, "{summary}");
+    assert!(
+        kept < 0.067 && kept < 0.05 * figure(&report, "rmse_before"),
+        "{kept}\n{summary}"
+    );
+}
+
+#[test]
+fn lists_the_library() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = twin(folder.path(), &["effects", "--json"]);
+    let rows: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let ids: Vec<&str> = rows
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|row| row["id"].as_str().unwrap())
+        .collect();
+    assert_eq!(ids, twin::model::registry::ids());
+    let table = String::from_utf8(twin(folder.path(), &["effects"]).stdout).unwrap();
+    for id in ids {
+        assert!(table.lines().any(|line| line == id), "{id}");
+    }
+}
+
+#[test]
+fn every_command_has_an_example() {
+    let folder = tempfile::tempdir().unwrap();
+    for command in ["simulate", "explain", "convert", "effects"] {
+        let output = twin(folder.path(), &[command, "--help"]);
+        let help = String::from_utf8(output.stdout).unwrap();
+        assert!(help.contains(&format!("  twin {command}")), "{help}");
+    }
+}

@@ -1,0 +1,261 @@
+//! The model file: what it may hold, what is said of faults, and how effects are added.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::{fs, path::Path};
+
+use twin::{
+    failure::Failure,
+    model::{Found, FrontEndKind, Model, Shift},
+};
+
+const PAIR: &str = "\
+# The user's own words.
+schema = 1   # a version
+
+[sensor]
+step = 0.1     # of the display
+noise = 0.02
+
+[effects.offset]
+offset_a = 0.25 # from last week
+";
+
+fn parse(text: &str) -> Result<Model, Failure> {
+    Model::parse("m.toml", text.to_owned(), Path::new("."))
+}
+
+#[test]
+fn reads_what_the_documentation_shows() {
+    // Each block of TOML in the documentation that is a whole model file.
+    let documentation = include_str!("../../docs/model-file.md");
+    let blocks: Vec<&str> = documentation
+        .split("```toml\n")
+        .skip(1)
+        .filter_map(|rest| rest.split("```").next())
+        .filter(|block| block.contains("schema = 1"))
+        .collect();
+    assert!(blocks.len() >= 2);
+    for block in blocks {
+        let model = parse(block).unwrap_or_else(|fault| panic!("{fault}\n{block}"));
+        assert!(model.sensor.is_some() || model.battery.is_some());
+    }
+}
+
+#[test]
+fn the_documentation_names_every_key() {
+    let documentation = include_str!("../../docs/model-file.md");
+    let unknown = [
+        "[sensor]\nx = 1",
+        "[charge]\nx = 1",
+        "[battery]\nx = 1",
+        "x = 1",
+    ];
+    for text in unknown {
+        let Err(Failure::Input(sentence)) = parse(&format!("schema = 1\n{text}\n")) else {
+            panic!("{text}");
+        };
+        let keys: Vec<&str> = sentence
+            .split("expected one of ")
+            .nth(1)
+            .unwrap()
+            .split('`')
+            .skip(1)
+            .step_by(2)
+            .collect();
+        assert!(keys.len() >= 4, "{sentence}");
+        for key in keys {
+            assert!(documentation.contains(key), "{key}");
+        }
+    }
+}
+
+#[test]
+fn the_models_of_this_project_are_read() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models");
+    let mut read = 0;
+    for file in fs::read_dir(folder).unwrap() {
+        let path = file.unwrap().path();
+        if path.extension().is_some_and(|ending| ending == "toml") {
+            Model::read(&path).unwrap_or_else(|fault| panic!("{fault}"));
+            read += 1;
+        }
+    }
+    assert!(read >= 4);
+}
+
+#[test]
+fn faults_name_line_key_and_what_was_expected() {
+    let cases: [(&str, &[&str]); 16] = [
+        (
+            "schema = 1\n[sensor]\nstepp = 1\n",
+            &["line 3", "stepp", "`step`", "`noise_coloured`"],
+        ),
+        (
+            "schema = 2\n[sensor]\n",
+            &["line 1", "schema", "found 2", "expected 1"],
+        ),
+        ("[sensor]\n", &["schema"]),
+        (
+            "schema = 1\n[sensor]\nstep = \"x\"\n",
+            &["line 3", "key step", "string", "f64"],
+        ),
+        (
+            "schema = 1\n[sensor]\nnoise = -1\n",
+            &["line 3", "sensor.noise", "-1", "zero or more"],
+        ),
+        (
+            "schema = 1\n[sensor]\nfront_end = \"hall\"\n",
+            &["line 3", "hall", "`dual-range`"],
+        ),
+        ("schema = 1\n", &["neither [sensor] nor [battery]"]),
+        (
+            "schema = 1\n[sensor]\nfront_end = \"hah1bv\"\nstep = 1\n",
+            &["line 4", "sensor.step", "its converter"],
+        ),
+        (
+            "schema = 1\n[sensor]\naverage = 8\n",
+            &["line 3", "average", "window_s"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 0\n",
+            &["line 3", "battery.capacity_ah", "above 0"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\ninitial_soc = 95\n",
+            &["line 4", "initial_soc", "0 to 1"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\nocv = [[0.5, 3.6], [0.4, 3.5]]\n",
+            &[
+                "line 4",
+                "battery.ocv",
+                "(0.4, 3.5) as point 2",
+                "ascending",
+            ],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.ofset]\noffset_a = 1\n",
+            &["line 3", "ofset", "offset, gain"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.offset]\noffset = 1\n",
+            &["line 4", "effects.offset.offset", "offset_a"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.clipping]\nhigh_a = 1\n",
+            &[
+                "line 3",
+                "effects.clipping",
+                "not all parameters",
+                "high_a, low_a",
+            ],
+        ),
+        ("schema = 1\n[sensor\n", &["line 2"]),
+    ];
+    for (text, expected) in cases {
+        let Err(Failure::Input(sentence)) = parse(text) else {
+            panic!("taken: {text}");
+        };
+        assert!(sentence.starts_with("m.toml"), "{sentence}");
+        assert!(!sentence.contains('\n'), "{sentence}");
+        for part in expected {
+            assert!(sentence.contains(part), "no {part} in: {sentence}");
+        }
+    }
+}
+
+#[test]
+fn an_extended_model_is_still_its_users_file() {
+    let model = parse(PAIR).unwrap();
+    let found = [
+        Found {
+            id: "lag".into(),
+            parameters: vec![("tau_s".into(), 0.1 + 0.2)],
+            comment: vec!["A low-pass.".into()],
+        },
+        Found {
+            id: "gain".into(),
+            parameters: vec![("gain".into(), 1.01)],
+            comment: Vec::new(),
+        },
+    ];
+    let here = Path::new(".");
+    let text = model
+        .extended(&found, Shift::default(), here, here)
+        .unwrap();
+    assert!(text.starts_with(PAIR), "{text}");
+    assert!(text.contains("# A low-pass.\n[effects.lag]"), "{text}");
+    let again = parse(&text).unwrap();
+    // In the order of the file, and to the last digit.
+    assert_eq!(
+        again.effects,
+        [
+            ("offset", vec![0.25]),
+            ("lag", vec![0.1 + 0.2]),
+            ("gain", vec![1.01])
+        ]
+    );
+    assert_eq!(again.sensor, model.sensor);
+    // Nothing found: nothing changed.
+    assert_eq!(
+        model.extended(&[], Shift::default(), here, here).unwrap(),
+        PAIR
+    );
+}
+
+#[test]
+fn an_effect_that_is_there_gets_the_new_values() {
+    let model = parse(PAIR).unwrap();
+    let found = [Found {
+        id: "offset".into(),
+        parameters: vec![("offset_a".into(), 0.5)],
+        comment: Vec::new(),
+    }];
+    let here = Path::new(".");
+    let text = model
+        .extended(&found, Shift::default(), here, here)
+        .unwrap();
+    assert_eq!(parse(&text).unwrap().effects, [("offset", vec![0.5])]);
+}
+
+#[test]
+fn an_extended_model_in_another_folder_finds_its_table() {
+    let folder = tempfile::tempdir().unwrap();
+    let models = folder.path().join("models");
+    fs::create_dir(&models).unwrap();
+    fs::write(folder.path().join("ocv.csv"), "soc,ocv_v\n0,3\n1,4\n").unwrap();
+    let path = models.join("m.toml");
+    let text = "schema = 1\n[battery]\ncapacity_ah = 2\nocv_file = \"../ocv.csv\" # measured\n\
+                ohmic_resistance_ohm = 0.02\ninitial_soc = 0.9\n";
+    fs::write(&path, text).unwrap();
+    let model = Model::read(&path).unwrap();
+    assert_eq!(
+        model.battery.as_ref().unwrap().ocv,
+        [(0.0, 3.0), (1.0, 4.0)]
+    );
+    // A folder that is not there yet.
+    let out = folder.path().join("deep/er");
+    let shift = Shift {
+        soc: -0.02,
+        resistance: 0.5,
+        alignment_s: 0.0,
+    };
+    let extended = model.extended(&[], shift, &models, &out).unwrap();
+    assert!(extended.contains("# measured"), "{extended}");
+    fs::create_dir_all(&out).unwrap();
+    let path = out.join("model.toml");
+    fs::write(&path, extended).unwrap();
+    let again = Model::read(&path).unwrap().battery.unwrap();
+    assert_eq!(again.ocv, [(0.0, 3.0), (1.0, 4.0)]);
+    assert!((again.initial_soc.unwrap() - 0.88).abs() < 1e-12);
+    assert!((again.resistance_ohm - 0.03).abs() < 1e-12);
+}
+
+#[test]
+fn a_board_has_what_its_design_says() {
+    let model = parse("schema = 1\n[sensor]\nfront_end = \"closed-loop\"\naverage = 8\n").unwrap();
+    let sensor = model.sensor.unwrap();
+    assert_eq!(sensor.front_end, FrontEndKind::ClosedLoop);
+    assert_eq!(sensor.average, Some(8));
+}

@@ -1,0 +1,499 @@
+//! From recordings to problems: what is masked, cut and counted once, and nothing that is invented.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::{fs, path::Path};
+
+use twin::{
+    align::{Signal, estimate},
+    failure::Failure,
+    model::Model,
+    prepare::{Inputs, Prepared, Purpose, prepare},
+    problem::{Base, Problem, View},
+};
+
+const PAIR: &str = "schema = 1\n[sensor]\n";
+
+fn text(header: &str, rows: impl Iterator<Item = Vec<f64>>) -> String {
+    let mut text = format!("{header}\n");
+    for row in rows {
+        let fields: Vec<String> = row
+            .iter()
+            .map(|value| {
+                if value.is_nan() {
+                    String::new()
+                } else {
+                    value.to_string()
+                }
+            })
+            .collect();
+        text.push_str(&fields.join(","));
+        text.push('\n');
+    }
+    text
+}
+
+fn read(
+    folder: &Path,
+    model: &str,
+    recording: &str,
+    mapping: &[&str],
+) -> Result<Prepared, Failure> {
+    let path = folder.join("r.csv");
+    fs::write(&path, recording).unwrap();
+    let model = Model::parse("m.toml", model.to_owned(), folder)?;
+    let inputs = Inputs {
+        recording: path,
+        reference: None,
+        mapping: mapping.iter().map(|text| (*text).to_owned()).collect(),
+    };
+    prepare(&model, &inputs, Purpose::Compare)
+}
+
+fn one(model: &str, recording: &str) -> (Problem, Vec<String>) {
+    let folder = tempfile::tempdir().unwrap();
+    let prepared = read(folder.path(), model, recording, &[]).unwrap();
+    assert_eq!(prepared.items.len(), 1);
+    (prepared.items[0].problem.clone(), prepared.remarks)
+}
+
+/// A current that never repeats itself.
+fn current(t_s: f64) -> f64 {
+    10.0 * (0.37 * t_s).sin() + 3.0 * (1.91 * t_s).sin() + 1.0
+}
+
+#[test]
+fn a_plain_pair_is_taken_as_it_is() {
+    let rows = (0..200).map(|k| {
+        let t = f64::from(k) * 0.1;
+        vec![t, current(t), current(t) + 0.5, 20.0 + t]
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a,temp_sensor_c", rows));
+    assert_eq!(problem.view, View::Sensor);
+    assert_eq!(
+        (problem.name.as_str(), problem.unit.as_str()),
+        ("i_meas_a", "A")
+    );
+    assert!(problem.observed.on_drive_rows);
+    assert_eq!(problem.observed.valid_rows(), 200);
+    assert_eq!(problem.drive.segments, vec![0..200]);
+    assert_eq!(problem.drive.reference[7], current(0.7));
+    assert_eq!(problem.observed.value[7], current(0.7) + 0.5);
+    assert!(problem.drive.supply_v.is_none());
+    assert!(problem.drive.sensor_temperature_c.is_some());
+    assert!(remarks.is_empty(), "{remarks:?}");
+}
+
+#[test]
+fn nothing_is_filled_in_but_the_surroundings() {
+    let rows = (0..200).map(|k| {
+        let t = f64::from(k) * 0.1;
+        let reference = if (40..45).contains(&k) {
+            f64::NAN
+        } else {
+            current(t)
+        };
+        let measured = if (40..45).contains(&k) || (90..120).contains(&k) {
+            f64::NAN
+        } else {
+            current(t)
+        };
+        let temperature = if k % 10 == 3 { 20.0 + t } else { f64::NAN };
+        vec![t, reference, measured, temperature]
+    });
+    let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a,temp_sensor_c", rows));
+    // Rows without a reference are no part of the drive; half a second is no gap.
+    assert_eq!(problem.drive.len(), 195);
+    assert_eq!(problem.drive.segments, vec![0..195]);
+    assert_eq!(problem.observed.valid_rows(), 165);
+    let masked = problem
+        .observed
+        .value
+        .iter()
+        .filter(|value| value.is_nan())
+        .count();
+    assert_eq!(masked, 30);
+    let temperature = problem.drive.sensor_temperature_c.unwrap();
+    assert_eq!(temperature[0], 20.3);
+    assert_eq!(temperature[12], 20.3);
+    assert_eq!(temperature[13], 21.3);
+}
+
+#[test]
+fn a_gap_begins_a_stretch_and_a_slow_rest_does_not() {
+    // 0.1 s, a gap of 60 s, 0.1 s, a rest at 10 s a row, 0.1 s.
+    let mut t = 0.0;
+    let mut times = Vec::new();
+    for k in 0..400 {
+        t += match k {
+            0 => 0.0,
+            100 => 60.0,
+            200..=230 => 10.0,
+            _ => 0.1,
+        };
+        times.push(t);
+    }
+    let rows = times.iter().map(|t| vec![*t, current(*t), current(*t)]);
+    let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    assert_eq!(problem.drive.segments, vec![0..100, 100..400]);
+    assert_eq!(problem.drive.continues, [false, true]);
+    assert_eq!(problem.observed.segment[99..101], [0, 1]);
+}
+
+#[test]
+fn a_clock_that_starts_anew_begins_a_stretch_of_its_own() {
+    let rows = (0..300).map(|k| {
+        let t = f64::from(k % 100) * 0.1;
+        vec![t, f64::from(k / 100), current(t), current(t)]
+    });
+    let (problem, _) = one(PAIR, &text("t_s,cycle,i_ref_a,i_meas_a", rows));
+    assert_eq!(problem.drive.segments, vec![0..100, 100..200, 200..300]);
+    assert_eq!(problem.drive.continues, [false, false, false]);
+}
+
+#[test]
+fn a_held_value_counts_once() {
+    // Measured each 0.1 s, read each 0.02 s.
+    let rows = (0..1000).map(|k| {
+        let t = f64::from(k) * 0.02;
+        vec![t, current(t), current(f64::from(k / 5) * 0.1)]
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    assert_eq!(problem.observed.valid_rows(), 200);
+    assert!((0..1000).all(|row| problem.observed.valid[row] == (row % 5 == 0)));
+    assert!(remarks[0].contains("100.000 ms"), "{remarks:?}");
+}
+
+#[test]
+fn a_held_value_that_stays_the_same_was_measured_again() {
+    // At a rail from 5 s to 10 s.
+    let rows = (0..1000).map(|k| {
+        let t = f64::from(k) * 0.02;
+        let held = f64::from(k / 5) * 0.1;
+        let value = if (5.0..10.0).contains(&held) {
+            20.0
+        } else {
+            current(held)
+        };
+        vec![t, current(t), value]
+    });
+    let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    let inside = (250..500)
+        .filter(|row| problem.observed.valid[*row])
+        .count();
+    // Once for each interval and a half at the latest.
+    assert!((30..=51).contains(&inside), "{inside}");
+}
+
+#[test]
+fn clipping_and_a_dead_band_are_no_holding() {
+    let clipped = (0..400).map(|k| {
+        let t = f64::from(k) * 0.1;
+        vec![t, current(t), current(t).clamp(-4.0, 5.0)]
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", clipped));
+    assert_eq!(problem.observed.valid_rows(), 400);
+    assert!(
+        remarks.iter().any(|remark| remark.contains("clipped")),
+        "{remarks:?}"
+    );
+    let dead = (0..400).map(|k| {
+        let t = f64::from(k) * 0.1;
+        let value = if current(t).abs() < 7.0 {
+            0.0
+        } else {
+            current(t)
+        };
+        vec![t, current(t), value]
+    });
+    let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", dead));
+    assert_eq!(problem.observed.valid_rows(), 400);
+    let coarse = (0..400).map(|k| {
+        let t = f64::from(k) * 0.1;
+        vec![t, current(t), (current(t) / 2.0).round() * 2.0]
+    });
+    let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", coarse));
+    assert_eq!(problem.observed.valid_rows(), 400);
+}
+
+#[test]
+fn rows_of_their_own_are_not_interpolated() {
+    // As a bus delivers them: either the one or the other.
+    let rows = (0..400).map(|k| {
+        let t = f64::from(k) * 0.05;
+        if k % 2 == 0 {
+            vec![t, current(t), f64::NAN]
+        } else {
+            vec![t, f64::NAN, current(t) + 0.5]
+        }
+    });
+    let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    assert!(!problem.observed.on_drive_rows);
+    assert_eq!(problem.drive.len(), 200);
+    assert_eq!(problem.observed.t_s.len(), 200);
+    assert!((problem.observed.t_s[3] - 0.35).abs() < 1e-12);
+    // The last one is after the drive's end.
+    assert_eq!(problem.observed.valid_rows(), 199);
+}
+
+#[test]
+fn a_minus_turns_the_sign() {
+    let folder = tempfile::tempdir().unwrap();
+    let rows = (0..200).map(|k| {
+        let t = f64::from(k) * 0.1;
+        vec![t, current(t), -current(t)]
+    });
+    let recording = text("Time,Shunt,Board", rows);
+    let mapping = ["t_s=Time", "i_ref_a=Shunt", "i_meas_a=-Board"];
+    let prepared = read(folder.path(), PAIR, &recording, &mapping).unwrap();
+    assert_eq!(prepared.items[0].problem.observed.value[5], current(0.5));
+    // The same in the model file, which the command line overrules.
+    let model = "schema = 1\n[columns]\nt_s = \"Time\"\ni_ref_a = \"Shunt\"\ni_meas_a = \"Shunt\"\n[sensor]\n";
+    let prepared = read(folder.path(), model, &recording, &["i_meas_a=-Board"]).unwrap();
+    assert_eq!(prepared.items[0].problem.observed.value[5], current(0.5));
+}
+
+#[test]
+fn a_counter_becomes_mean_currents_and_a_reset_cuts() {
+    // 1 A for 300 s at 0.5 s, with a counter set anew after 150 s.
+    let rows = (0..600).map(|k| {
+        let t = f64::from(k) * 0.5;
+        let reference = 1.0 + 0.1 * (0.2 * t).sin();
+        let charge = t - 0.5 * ((0.2 * t).cos() - 1.0);
+        vec![
+            t,
+            reference,
+            if k < 300 {
+                1e4 + charge
+            } else {
+                charge - 150.0
+            },
+        ]
+    });
+    let model = "schema = 1\n[sensor]\n[charge]\nstep_c = 0.001\n";
+    let (problem, remarks) = one(model, &text("t_s,i_ref_a,q_meas_c", rows));
+    assert_eq!(
+        (problem.view, problem.name.as_str(), problem.unit.as_str()),
+        (View::Charge, "q_meas_c", "A")
+    );
+    assert!(
+        remarks
+            .iter()
+            .any(|remark| remark.contains("set anew 1 times")),
+        "{remarks:?}"
+    );
+    assert_eq!(problem.drive.segments, vec![0..300, 300..600]);
+    // Each second one, and the first of each stretch has no difference.
+    assert_eq!(problem.observed.valid_rows(), 299 - 1);
+    let predicted = twin::explain::predict(&problem, &[]);
+    for (row, simulated) in predicted.iter().enumerate() {
+        if problem.observed.valid[row] {
+            // The counter is exact; straight lines between the rows of the drive are not, by h²/12 of the curvature.
+            let bound = 0.25 / 12.0 * 0.1 * 0.04;
+            assert!(
+                (problem.observed.value[row] - simulated).abs() < 1.1 * bound,
+                "row {row}"
+            );
+        }
+    }
+}
+
+const BATTERY: &str = "schema = 1\n[battery]\ncapacity_ah = 1\nocv = [[0, 3.0], [1, 4.0]]\nohmic_resistance_ohm = 0.01\n";
+
+fn discharge(counter: bool) -> String {
+    // 0.5 A for 600 s, 3000 s without a row, 0.5 A for 600 s. A constant current is a fine current.
+    let header = if counter {
+        "t_s,i_ref_a,v_cell_v,ah_meas_ah"
+    } else {
+        "t_s,i_ref_a,v_cell_v"
+    };
+    let rows = (0..1200).map(|k| {
+        let t = f64::from(k) + if k < 600 { 0.0 } else { 3000.0 };
+        // During the gap 0.1 A flowed.
+        let ah = 0.5 * f64::from(k) / 3600.0
+            + if k < 600 {
+                0.0
+            } else {
+                (0.1 * 3001.0 - 0.5) / 3600.0
+            };
+        let ripple = 0.001 * f64::from(k % 7);
+        let volts = 3.0 + (0.9 - ah) - 0.01 * (0.5 + ripple);
+        let mut row = vec![t, 0.5 + ripple, volts];
+        if counter {
+            row.push(ah);
+        }
+        row
+    });
+    text(header, rows)
+}
+
+#[test]
+fn the_state_of_charge_goes_on_over_a_gap() {
+    let (problem, remarks) = one(BATTERY, &discharge(true));
+    assert_eq!(problem.view, View::Voltage);
+    let Base::Battery(base) = &problem.base else {
+        panic!("{problem:?}");
+    };
+    assert_eq!(base.initial_soc.len(), 2);
+    // From the first reading: open circuit is 3 V and the state of charge.
+    assert!(
+        (base.initial_soc[0] - 0.9).abs() < 1e-6,
+        "{:?}",
+        base.initial_soc
+    );
+    assert!(base.initial_soc_sigma > 0.005);
+    assert!(
+        remarks.iter().any(|remark| remark.contains("initial_soc")),
+        "{remarks:?}"
+    );
+    // By the counter: 0.1 A in the gap.
+    let after = 0.9 - (0.503 * 599.0 + 0.1 * 3001.0) / 3600.0;
+    assert!(
+        (base.initial_soc[1] - after).abs() < 1e-3,
+        "{:?}",
+        base.initial_soc
+    );
+    // Without a counter, along a straight line, and it is said.
+    let (problem, remarks) = one(BATTERY, &discharge(false));
+    let Base::Battery(base) = &problem.base else {
+        panic!("{problem:?}");
+    };
+    // 0.504 A before and 0.505 A after it.
+    let after = 0.9 - (0.503 * 599.0 + 0.5045 * 3001.0) / 3600.0;
+    assert!(
+        (base.initial_soc[1] - after).abs() < 1e-3,
+        "{:?}",
+        base.initial_soc
+    );
+    assert!(
+        remarks
+            .iter()
+            .any(|remark| remark.contains("straight line")),
+        "{remarks:?}"
+    );
+}
+
+#[test]
+fn a_pack_is_its_cells_in_series() {
+    let rows = (0..100).map(|k| {
+        let i = current(f64::from(k));
+        vec![f64::from(k), i, 4.0 * (3.9 - 0.01 * i)]
+    });
+    let model = format!("{BATTERY}cells = 4\ninitial_soc = 0.9\n");
+    let (problem, _) = one(&model, &text("t_s,i_ref_a,v_pack_v", rows));
+    let Base::Battery(base) = &problem.base else {
+        panic!("{problem:?}");
+    };
+    assert_eq!(base.ocv, [(0.0, 12.0), (1.0, 16.0)]);
+    assert!((base.resistance_ohm - 0.04).abs() < 1e-12);
+    assert_eq!(base.initial_soc, [0.9]);
+}
+
+/// A load of steps at times that follow no rule.
+fn steps(t_s: f64) -> f64 {
+    let at = [
+        0.0, 7.1, 9.8, 17.3, 21.9, 30.2, 31.7, 44.0, 52.6, 61.1, 64.9, 78.3, 85.5, 97.0, 108.4,
+        118.9,
+    ];
+    let before = at.iter().filter(|step| **step <= t_s).count();
+    [2.0, 9.0, -3.0, 14.0, 5.0][before % 5] + 0.3 * (2.3 * t_s).sin()
+}
+
+#[test]
+fn two_clocks_are_compared() {
+    for (offset_s, fast_ppm, tau_s) in [
+        (3.217, 0.0, 0.0),
+        (-1.13, 300.0, 0.0),
+        (0.45, -200.0, 0.4),
+        (12.0, 100.0, 0.2),
+    ] {
+        // The reference at 100 Hz, the sensor at 20 Hz through a low-pass.
+        let reference: Vec<(f64, f64)> = (0..12_000)
+            .map(|k| f64::from(k) * 0.01)
+            .map(|t| (t, steps(t)))
+            .collect();
+        let mut slow = steps(0.0);
+        let mut sensed = Vec::new();
+        for (row, (t, value)) in reference.iter().enumerate() {
+            if tau_s > 0.0 {
+                slow += (value - slow) * (1.0 - f64::exp(-0.01 / tau_s));
+            } else {
+                slow = *value;
+            }
+            if row % 5 == 0 && *t > 5.0 && *t < 105.0 {
+                sensed.push((
+                    (t - 5.0) * (1.0 + fast_ppm * 1e-6) + 5.0 - offset_s,
+                    1.02 * slow + 0.1,
+                ));
+            }
+        }
+        let split = |rows: &[(f64, f64)]| -> (Vec<f64>, Vec<f64>) { rows.iter().copied().unzip() };
+        let (t_ref, x) = split(&reference);
+        let (t_sensor, y) = split(&sensed);
+        let driven = Signal::new(&t_ref, &x, |_| true);
+        let found = estimate(&driven, &Signal::new(&t_sensor, &y, |_| true)).unwrap();
+        // Within a fifth of the sensor's step; with a lag within a fifth of that.
+        let bound = 0.01_f64.max(0.2 * tau_s);
+        for at in [0, t_sensor.len() / 2, t_sensor.len() - 1] {
+            let truth = 5.0 + (t_sensor[at] + offset_s - 5.0) / (1.0 + fast_ppm * 1e-6);
+            let error = found.on_reference(t_sensor[at]) - truth;
+            assert!(
+                error.abs() < bound,
+                "{offset_s} {fast_ppm} {tau_s}: off by {error} s, {found:?}"
+            );
+        }
+        assert!(
+            (found.fast_ppm - fast_ppm).abs() < 60.0,
+            "{fast_ppm}: {found:?}"
+        );
+    }
+}
+
+#[test]
+fn a_reference_of_its_own_becomes_the_drive() {
+    let folder = tempfile::tempdir().unwrap();
+    let reference = (0..6000).map(|k| {
+        let t = f64::from(k) * 0.02;
+        vec![t, steps(t), 20.0 + t]
+    });
+    let reference = text("t_s,i_ref_a,temp_sensor_c", reference);
+    let sensor = (0..900).map(|k| {
+        let t = f64::from(k) * 0.1;
+        // 100 s later on a clock of its own.
+        vec![t + 100.0, steps(t + 10.0) + 0.2, 5.0 + 0.001 * t]
+    });
+    fs::write(folder.path().join("ref.csv"), reference).unwrap();
+    fs::write(
+        folder.path().join("r.csv"),
+        text("t_s,i_meas_a,v_supply_v", sensor),
+    )
+    .unwrap();
+    let model = Model::parse("m.toml", PAIR.to_owned(), folder.path()).unwrap();
+    let inputs = Inputs {
+        recording: folder.path().join("r.csv"),
+        reference: Some(folder.path().join("ref.csv")),
+        mapping: Vec::new(),
+    };
+    let prepared = prepare(&model, &inputs, Purpose::Compare).unwrap();
+    let problem = &prepared.items[0].problem;
+    assert_eq!(problem.drive.len(), 6000);
+    assert!(!problem.observed.on_drive_rows);
+    assert!(
+        (problem.observed.t_s[0] - 10.0).abs() < 0.03,
+        "{}",
+        problem.observed.t_s[0]
+    );
+    assert_eq!(
+        problem.drive.sensor_temperature_c.as_ref().unwrap()[50],
+        21.0
+    );
+    assert!(problem.drive.supply_v.is_some());
+    assert!(
+        prepared
+            .remarks
+            .iter()
+            .any(|remark| remark.contains("clocks")),
+        "{:?}",
+        prepared.remarks
+    );
+}

@@ -1,0 +1,420 @@
+//! The board as designed against the firmware's own composition, and the simulation against the one that explains.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+// A drive of one segment is a list of one range.
+#![allow(clippy::single_range_in_vec_init)]
+
+#[path = "../../core-logic/tests/support/host_board.rs"]
+mod host_board;
+#[path = "../../core-logic/tests/support/ideal_board.rs"]
+mod ideal_board;
+
+use std::{fs, path::Path};
+
+use core_logic::configuration::Configuration;
+use host_board::{HostBoard, Step};
+use ideal_board::{Event, Row, Timing};
+use twin::{
+    explain,
+    model::{FrontEndKind, Model},
+    prepare::{Inputs, Prepared, Purpose, prepare},
+    problem::{Base, BatteryBase, Drive, Observed, Problem, SensorBase, View},
+    simulate::{
+        board::{Board, Pace},
+        command::columns,
+        designed,
+    },
+};
+
+/// Through both ranges, both signs, with steps and rests.
+fn profile() -> Vec<Row> {
+    let mut rows = Vec::new();
+    for k in 0..1200 {
+        let t_s = f64::from(k) * 0.1;
+        let current_a = match k % 400 {
+            0..100 => 0.0,
+            100..200 => 12.0 * (0.8 * t_s).sin(),
+            200..300 => 150.0 * (0.3 * t_s).sin() + 5.0,
+            _ => 45.0,
+        };
+        rows.push(Row {
+            t_s,
+            current_a,
+            cell_v: 3.7,
+        });
+    }
+    rows
+}
+
+fn drive(rows: &[Row]) -> Drive {
+    Drive {
+        t_s: rows.iter().map(|row| row.t_s).collect(),
+        reference: rows.iter().map(|row| row.current_a).collect(),
+        segments: vec![0..rows.len()],
+        continues: vec![false],
+        ..Drive::default()
+    }
+}
+
+fn observed(t_s: Vec<f64>) -> Observed {
+    let rows = t_s.len();
+    Observed {
+        t_s,
+        value: vec![f64::NAN; rows],
+        valid: vec![true; rows],
+        segment: vec![0; rows],
+        on_drive_rows: false,
+    }
+}
+
+#[test]
+fn the_board_reports_what_the_firmwares_composition_does() {
+    let rows = profile();
+    let mut host = HostBoard::new(&rows, Timing::default(), Configuration::default());
+    // Reading and charge after each conversion.
+    let (mut t_s, mut current, mut charge, mut edge) =
+        (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let mut edges = 0;
+    while let Some(step) = host.step() {
+        if let Step::Event(Event::Conversion { at_us, .. }) = step {
+            t_s.push(at_us as f64 * 1e-6);
+            current.push(f64::from(host.measurement.current().current.get()) * 1e-6);
+            charge.push(host.meter.report().charge_total.get() as f64 * 1e-9);
+            edge.push(host.world.edges != edges);
+            edges = host.world.edges;
+        }
+    }
+    assert!(edges >= 8, "{edges} range changes");
+    let board = Board::new(FrontEndKind::DualRange, 1).unwrap();
+    let reported = board.run(&drive(&rows), false, &observed(t_s), Pace::Seen, true);
+    let mut compared = 0;
+    for row in 5..current.len() {
+        // The composition masks conversions with an edge and the settling after it.
+        if edge[row] || edge[row - 1] || reported.current_a[row].is_nan() {
+            continue;
+        }
+        let step = board.step_a()
+            * if reported.range_high[row] > 0.5 {
+                10.0
+            } else {
+                1.0
+            };
+        let apart = (reported.current_a[row] - current[row]).abs();
+        // The same conversion through the same code: a code at most, where rounding falls the other way.
+        assert!(
+            apart <= 1.01 * step,
+            "row {row}: {} and {}",
+            reported.current_a[row],
+            current[row]
+        );
+        compared += 1;
+    }
+    assert!(compared > 3000, "{compared}");
+    // The composition reads its meter every 20 ms, late by up to that at 150 A (3 C); and 30 mC a range change.
+    let last = charge.len() - 1;
+    let bound = 150.0 * 0.02 + 0.0302 * edges as f64 + 0.067;
+    assert!(
+        (reported.charge_c[last] - charge[last]).abs() < bound,
+        "{} and {}",
+        reported.charge_c[last],
+        charge[last]
+    );
+}
+
+#[test]
+fn the_counter_counts_the_charge() {
+    let rows = profile();
+    let drive = drive(&rows);
+    let mut flowed = vec![0.0];
+    for pair in rows.windows(2) {
+        let last = flowed[flowed.len() - 1];
+        flowed.push(last + 0.5 * (pair[0].current_a + pair[1].current_a) * 0.1);
+    }
+    for kind in [
+        FrontEndKind::DualRange,
+        FrontEndKind::Hah1bv,
+        FrontEndKind::Network,
+        FrontEndKind::ClosedLoop,
+    ] {
+        let board = Board::new(kind, 1).unwrap();
+        let reported = board.run(
+            &drive,
+            false,
+            &observed(drive.t_s.clone()),
+            Pace::Free,
+            true,
+        );
+        let changes = reported
+            .range_high
+            .windows(2)
+            .filter(|pair| pair[0] != pair[1])
+            .count();
+        let step = board.charge_step_c() * if changes > 0 { 10.0 } else { 1.0 };
+        for (row, (counted, flowed)) in reported.charge_c.iter().zip(&flowed).enumerate() {
+            // A count, and the hidden fraction of one at each range change.
+            let bound = 1.1 * step + 0.0302 * changes as f64;
+            assert!(
+                (counted - flowed).abs() < bound,
+                "{kind:?} row {row}: {counted} and {flowed}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_reading_is_the_current_within_half_a_step() {
+    for (kind, level) in [
+        (FrontEndKind::DualRange, 33.0),
+        (FrontEndKind::Hah1bv, -412.0),
+        (FrontEndKind::Network, 250.0),
+        (FrontEndKind::ClosedLoop, 299.0),
+    ] {
+        let board = Board::new(kind, 8).unwrap();
+        let t_s: Vec<f64> = (0..200).map(|k| f64::from(k) * 0.05).collect();
+        let drive = Drive {
+            reference: vec![level; 200],
+            segments: vec![0..200],
+            continues: vec![false],
+            t_s: t_s.clone(),
+            ..Drive::default()
+        };
+        let reported = board.run(&drive, false, &observed(t_s), Pace::Free, false);
+        for current in reported.current_a {
+            assert!(
+                (current - level).abs() <= 0.51 * board.step_a(),
+                "{kind:?}: {current}"
+            );
+        }
+    }
+    // Steps by hand: 120 A · 5 V / 4.5 V / 2¹³ codes; 5 V / 2¹³ / 4 mV/A.
+    let step = |kind| Board::new(kind, 1).unwrap().step_a();
+    assert!((step(FrontEndKind::DualRange) - 60.0 / 2.25 * 5.0 / 8192.0).abs() < 1e-9);
+    assert!((step(FrontEndKind::Hah1bv) - 5.0 / 8192.0 / 0.004).abs() < 1e-9);
+}
+
+#[test]
+fn the_range_changes_with_hysteresis() {
+    let board = Board::new(FrontEndKind::DualRange, 1).unwrap();
+    let t_s: Vec<f64> = (0..2001).map(|k| f64::from(k) * 0.1).collect();
+    // Up to 60 A and back in 200 s.
+    let reference: Vec<f64> = t_s.iter().map(|t| 60.0 - 0.6 * (t - 100.0).abs()).collect();
+    let drive = Drive {
+        reference: reference.clone(),
+        segments: vec![0..2001],
+        continues: vec![false],
+        t_s: t_s.clone(),
+        ..Drive::default()
+    };
+    let reported = board.run(&drive, false, &observed(t_s), Pace::Free, false);
+    let changes: Vec<f64> = (1..2001)
+        .filter(|row| reported.range_high[*row] != reported.range_high[row - 1])
+        .map(|row| reference[row])
+        .collect();
+    assert_eq!(changes.len(), 2);
+    // 4.5 V and 20 mV back, at 37.5 mV/A; a row is 0.06 A, a conversion 0.02 A.
+    assert!((changes[0] - 53.333).abs() < 0.13, "{}", changes[0]);
+    assert!((changes[1] - 52.8).abs() < 0.13, "{}", changes[1]);
+}
+
+fn problem(view: View, base: Base, drive: Drive, observed: Observed) -> Problem {
+    Problem {
+        view,
+        name: "x".into(),
+        unit: "A".into(),
+        drive,
+        observed,
+        base,
+        modelled: Vec::new(),
+        noise: 0.0,
+        accuracy: Default::default(),
+    }
+}
+
+/// The simulation here and the one that explains are two codes: without effects they have to agree.
+#[test]
+fn explaining_begins_where_simulating_ends() {
+    let rows = profile();
+    let drive = drive(&rows);
+    let own: Vec<f64> = (0..900).map(|k| 3.0 + f64::from(k) * 0.123).collect();
+    let shared = Observed {
+        on_drive_rows: true,
+        ..observed(drive.t_s.clone())
+    };
+    let battery = BatteryBase {
+        capacity_ah: 2.0,
+        efficiency: 0.99,
+        initial_soc: vec![0.8],
+        ocv: vec![(0.0, 3.0), (0.3, 3.5), (1.0, 4.1)],
+        resistance_ohm: 0.001,
+        ..BatteryBase::default()
+    };
+    let sensor = |window_s, held_reference| {
+        Base::Sensor(SensorBase {
+            window_s,
+            held_reference,
+            ..SensorBase::default()
+        })
+    };
+    let cases = [
+        (View::Sensor, sensor(0.0, false), shared.clone()),
+        (View::Sensor, sensor(0.0, false), observed(own.clone())),
+        (View::Sensor, sensor(0.0, true), observed(own.clone())),
+        (View::Sensor, sensor(0.7, false), shared.clone()),
+        (View::Charge, sensor(0.0, false), observed(own.clone())),
+        (View::Charge, sensor(0.0, true), observed(own.clone())),
+        (
+            View::StateOfCharge,
+            Base::Battery(battery.clone()),
+            shared.clone(),
+        ),
+        (View::Voltage, Base::Battery(battery.clone()), shared),
+        (View::Voltage, Base::Battery(battery), observed(own)),
+    ];
+    for (index, (view, base, observed)) in cases.into_iter().enumerate() {
+        let problem = problem(view, base, drive.clone(), observed);
+        let (here, there) = (designed(&problem), explain::predict(&problem, &[]));
+        assert_eq!(here.len(), there.len());
+        let mut compared = 0;
+        for (row, (here, there)) in here.iter().zip(&there).enumerate() {
+            if here.is_nan() && there.is_nan() {
+                continue;
+            }
+            assert!(
+                (here - there).abs() < 1e-9,
+                "case {index}, row {row}: {here} and {there}"
+            );
+            compared += 1;
+        }
+        assert!(compared >= 899, "case {index}: {compared}");
+    }
+}
+
+fn prepared(folder: &Path, model: &str, recording: &str, purpose: Purpose) -> (Model, Prepared) {
+    let path = folder.join("r.csv");
+    fs::write(&path, recording).unwrap();
+    let model = Model::parse("m.toml", model.to_owned(), folder).unwrap();
+    let inputs = Inputs {
+        recording: path,
+        ..Inputs::default()
+    };
+    let prepared = prepare(&model, &inputs, purpose).unwrap();
+    (model, prepared)
+}
+
+fn recording() -> String {
+    let mut text = "t_s,i_ref_a,i_meas_a\n".to_owned();
+    for row in profile() {
+        text.push_str(&format!(
+            "{},{},{}\n",
+            row.t_s,
+            row.current_a,
+            1.01 * row.current_a + 0.3
+        ));
+    }
+    text
+}
+
+/// "After" in the report is what the extended model simulates.
+#[test]
+fn an_extended_model_reproduces_the_explanation() {
+    let folder = tempfile::tempdir().unwrap();
+    let effects = [
+        ("offset".to_owned(), vec![0.3]),
+        ("lag".to_owned(), vec![0.4]),
+        ("gain".to_owned(), vec![1.01]),
+    ];
+    for front_end in ["pair", "dual-range"] {
+        let plain = format!("schema = 1\n[sensor]\nfront_end = \"{front_end}\"\n");
+        let extended = format!(
+            "{plain}[effects.offset]\noffset_a = 0.3\n[effects.lag]\ntau_s = 0.4\n[effects.gain]\ngain = 1.01\n"
+        );
+        let (_, plain) = prepared(folder.path(), &plain, &recording(), Purpose::Compare);
+        let after = explain::predict(&plain.items[0].problem, &effects);
+        let (model, extended) = prepared(folder.path(), &extended, &recording(), Purpose::Compare);
+        assert_eq!(extended.items[0].problem.modelled.len(), 3);
+        let written = columns(&model, &extended);
+        let again = &written
+            .iter()
+            .find(|(name, _)| name == "i_meas_a")
+            .unwrap()
+            .1;
+        let mut compared = 0;
+        for (row, (after, again)) in after.iter().zip(again).enumerate() {
+            if after.is_finite() {
+                assert!(
+                    (after - again).abs() < 1e-9,
+                    "{front_end}, row {row}: {after} and {again}"
+                );
+                compared += 1;
+            }
+        }
+        assert!(compared > 1000, "{compared}");
+    }
+}
+
+#[test]
+fn simulating_needs_nothing_but_the_drive() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut text = "t_s,i_ref_a\n".to_owned();
+    for row in profile() {
+        text.push_str(&format!("{},{}\n", row.t_s, row.current_a));
+    }
+    let model = "schema = 1\n[sensor]\nfront_end = \"dual-range\"\n[battery]\ncapacity_ah = 100\ninitial_soc = 0.5\n\
+                 ocv = [[0, 3.0], [1, 4.0]]\nohmic_resistance_ohm = 0.001\n";
+    let (model, prepared) = prepared(folder.path(), model, &text, Purpose::Simulate);
+    let written = columns(&model, &prepared);
+    let names: Vec<&str> = written.iter().map(|(name, _)| name.as_str()).collect();
+    assert_eq!(
+        names,
+        ["t_s", "i_meas_a", "soc_pct", "v_cell_v", "q_meas_c"]
+    );
+    let column = |name: &str| &written.iter().find(|(known, _)| known == name).unwrap().1;
+    // 45 A at the end: open circuit less the ohmic drop.
+    let (soc, volts) = (column("soc_pct")[1199], column("v_cell_v")[1199]);
+    assert!((volts - (3.0 + soc / 100.0 - 0.045)).abs() < 1e-9);
+    // A straight line counts what the state of charge has lost, within counts and range changes.
+    let charge = column("q_meas_c")[1199];
+    assert!(
+        (charge - (50.0 - soc) / 100.0 * 100.0 * 3600.0).abs() < 1.0,
+        "{charge} {soc}"
+    );
+}
+
+/// Rows of 10 ms see a conversion up to 10 ms late; the conversions themselves come evenly.
+#[test]
+fn conversions_are_even_though_rows_see_them_late() {
+    let board = Board::new(FrontEndKind::Hah1bv, 1).unwrap();
+    let period_s = board.conversion_s();
+    let t_s: Vec<f64> = (0..6000).map(|k| f64::from(k) * 0.01).collect();
+    let drive = Drive {
+        reference: t_s.iter().map(|t| 200.0 * (2.0 * t).sin()).collect(),
+        segments: vec![0..6000],
+        continues: vec![false],
+        t_s: t_s.clone(),
+        ..Drive::default()
+    };
+    let rows = observed(t_s.clone());
+    let free = board.run(&drive, false, &rows, Pace::Free, false).current_a;
+    let mut seen = rows.clone();
+    for row in 1..6000 {
+        let done = |row: usize| (t_s[row] / period_s + 1e-9).floor();
+        seen.valid[row] = done(row) != done(row - 1);
+    }
+    // What was read; a stretch in which nothing changes tells nothing of the grid, and is counted by the row.
+    seen.value.clone_from(&free);
+    for row in 3000..3500 {
+        seen.value[row] = 7.0;
+        seen.valid[row] = row % 5 == 0;
+    }
+    let again = board.run(&drive, false, &seen, Pace::Seen, false).current_a;
+    // 400 A/s: 10 ms late would be 4 A. The grid is found within half a millisecond, and codes are 0.15 A.
+    for row in (100..3000).chain(3510..6000) {
+        let apart = (free[row] - again[row]).abs();
+        assert!(
+            apart < 0.2 + board.step_a(),
+            "row {row}: {} and {}",
+            free[row],
+            again[row]
+        );
+    }
+}
