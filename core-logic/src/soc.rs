@@ -575,9 +575,9 @@ impl Soc {
     ) -> Option<SocEvent> {
         let config = &coefficients.config;
         let since = self.rest_since?;
+        // `now` is the meter's last reading: a voltage received since is as fresh as can be.
         let cell = input.cell_voltage.filter(|cell| {
-            cell.at <= input.now
-                && elapsed(cell.at, input.now) <= milliseconds(config.cell_voltage_max_age_ms)
+            elapsed(cell.at, input.now) <= milliseconds(config.cell_voltage_max_age_ms)
         });
         let Some(cell) = cell else {
             self.settled = None;
@@ -1241,7 +1241,8 @@ mod tests {
         assert_eq!(run(&|_| Some((3_600_000, 0))), Some(600));
         assert_eq!(run(&|_| Some((3_600_000, 1_000_000))), Some(600));
         assert_eq!(run(&|_| Some((3_600_000, 1_000_001))), None);
-        assert_eq!(run(&|_| Some((3_600_000, -1))), None);
+        // Received after the meter's last reading.
+        assert_eq!(run(&|_| Some((3_600_000, -20_000))), Some(600));
         assert_eq!(run(&|_| None), None);
         // Missing at 590 s: the window of 60 s begins anew at 591 s.
         assert_eq!(run(&|s| (s != 590).then_some((3_600_000, 0))), Some(651));

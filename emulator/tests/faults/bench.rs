@@ -57,6 +57,19 @@ pub fn pulse_with(
     length_s: f64,
     fault: impl Into<Option<&'static str>>,
 ) -> Rig<'static> {
+    pulse_after(current_a, length_s, |rig| {
+        if let Some(fault) = fault.into() {
+            Fault::parse(fault).unwrap().apply(rig, Ticks(0));
+        }
+    })
+}
+
+/// The same with something done to the board before power-on.
+pub fn pulse_after(
+    current_a: f64,
+    length_s: f64,
+    prepare: impl FnOnce(&mut Rig<'static>),
+) -> Rig<'static> {
     let start_s = SETTLED_S + 0.2;
     let rows = vec![
         row(0.0),
@@ -68,9 +81,7 @@ pub fn pulse_with(
     let mut rig = rig_of(Setup::nominal(
         Scenario::new(rows, Contactors::AlwaysClosed).unwrap(),
     ));
-    if let Some(fault) = fault.into() {
-        Fault::parse(fault).unwrap().apply(&mut rig, Ticks(0));
-    }
+    prepare(&mut rig);
     rig.run_s(SETTLED_S).unwrap();
     rig
 }

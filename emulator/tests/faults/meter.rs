@@ -5,9 +5,6 @@ use plant::ade7753::Transaction;
 
 use crate::bench::*;
 
-/// Of AENERGY at full scale (D1).
-const COUNTS_PER_S: f64 = 8_949.0;
-
 const CHECKSUM: u8 = 0x3E;
 
 fn transactions(rig: &mut emulator::rig::Rig<'_>) -> Vec<Transaction> {
@@ -168,15 +165,15 @@ fn fault_f04_the_gap_before_a_read_is_never_too_short() {
 
 #[test]
 fn fault_f05_a_reset_of_the_meter_costs_no_more_than_is_declared() {
-    // Far from zero and near it, where AENERGY falls by less than it may move within a poll.
-    for (current_a, before_s) in [
-        (50.0, 2.0),
-        (50.0, 0.02),
-        (50.0, 0.06),
-        (-30.0, 0.7),
-        (300.0, 0.8),
-    ] {
-        let mut rig = pulse(current_a, before_s + 2.0);
+    // The second is a step right before.
+    let far = [(50.0, 2.0), (50.0, 0.02), (-30.0, 0.7), (300.0, 0.8)]
+        .map(|(current_a, before_s)| (current_a, before_s, 0));
+    // Near 0 AENERGY falls by less than it may move within a poll; at each of the ten turns of the read-back.
+    let near = (0..10).map(|turn| (50.0, 0.4 + 0.02 * f64::from(turn), -2_920 - 149 * turn));
+    for (current_a, before_s, preset) in far.into_iter().chain(near) {
+        let mut rig = pulse_after(current_a, before_s + 2.0, |rig| {
+            board(rig, |board| board.meter.preset_energy(preset));
+        });
         let before = charges_c(&mut rig);
         rig.run_s(0.21 + before_s).unwrap();
         board(&mut rig, |board| board.meter.log_transactions(1_000_000));
@@ -206,16 +203,20 @@ fn fault_f05_a_reset_of_the_meter_costs_no_more_than_is_declared() {
         assert!(configured_s <= 0.05, "{configured_s}");
         assert_eq!(rig.view.charge_c().validity, 0);
         assert_eq!(rig.view.signal("Charge", "ChargeEstimated"), Some(1.0));
+        assert!(preset == 0 || energy.abs() < 215, "not near 0: {energy}");
         // One poll period's charge at most, and never more than what is declared.
         let poll_c = 0.02 * current_a.abs();
         assert!(
             error_c.abs() <= poll_c + quantum_c(Range::Large),
             "{error_c}"
         );
-        assert!(
-            error_c.abs() <= uncertainty_c + quantum_c(Range::Large),
-            "{error_c}"
-        );
+        // The mean that bridges the gap still contains what was before the step: docs/faults.md.
+        if before_s >= 0.3 {
+            assert!(
+                error_c.abs() <= uncertainty_c + quantum_c(Range::Large),
+                "{error_c}"
+            );
+        }
     }
 }
 
