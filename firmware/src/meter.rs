@@ -3,7 +3,8 @@
 //! It works in steps of one register each, at most 37 µs of polled SPI (2.6 MHz, two gaps of t9), and looks for a range
 //! edge before every step. So the worst time from an edge to the instant at which the chip latches AENERGY is one step
 //! under way, the way into the task and the command byte: 37 + 5 + 4 µs of the 100 µs that the hand-over is allowed, and
-//! 65 + 5 + 4 µs when the step is the write that starts a temperature conversion or a snapshot near AENERGY = 0.
+//! 65 + 5 + 4 µs when the step is the write that starts a temperature conversion, 68 + 5 + 4 µs when it is a snapshot near
+//! AENERGY = 0.
 //! Polling instead of an interrupt per byte: at 3 µs a byte an interrupt costs more than the wait.
 
 use ade7753::{
