@@ -562,6 +562,7 @@ fn milliseconds(milliseconds: u32) -> Duration {
 #[cfg(test)]
 #[allow(
     clippy::unwrap_used,
+    clippy::panic,
     clippy::indexing_slicing,
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss
