@@ -16,7 +16,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use crate::effects::chain::{Chain, Nuisance};
-use crate::effects::{Effect, find, find_with};
+use crate::effects::{Effect, Search, find, find_with};
 use crate::problem::Problem;
 use crate::report::data::{
     EffectReport, FittedModel, HoldoutReport, Inputs, Location, ParameterReport, Report,
@@ -35,6 +35,8 @@ const LEFT: f64 = 0.1;
 const DOUBTFUL: f64 = 0.12;
 /// An effect that makes the error in another file larger by this factor is not that file's physics.
 const WORSE: f64 = 1.05;
+/// An interval whose ends differ by this factor says nothing.
+const VAGUE: f64 = 100.0;
 /// Folds for the figures of held-out blocks, each with a fit of its own.
 const FOLDS: usize = 5;
 
@@ -169,6 +171,7 @@ fn one(
     let before = features.explain(&selection.plain.residual, options.seed);
     let left = features.explain(&selection.fit.residual, options.seed);
     veto(&bench, &mut selection, problem, holdouts);
+    vague(&bench, &mut selection, options.seed);
     let verdict = judge(&bench, &mut selection, before, left);
     let model = &selection.fit.model;
 
@@ -272,6 +275,38 @@ fn veto(bench: &Workbench<'_>, selection: &mut Selection, problem: &Problem, hol
             selection.fit.model.members[index].id(),
             ratio
         ));
+        selection.fit = fit::polish(bench, &without);
+        selection.rename(bench);
+    }
+}
+
+/// Takes effects out again whose values the recording does not tell to within orders of magnitude.
+fn vague(bench: &Workbench<'_>, selection: &mut Selection, seed: u64) {
+    while !selection.named.is_empty() {
+        let intervals = intervals::intervals(bench, &selection.fit, seed);
+        let members = &selection.fit.model.members;
+        let found = members
+            .iter()
+            .zip(&intervals)
+            .position(|(member, intervals)| {
+                let parameters = member.effect.card().parameters;
+                parameters
+                    .iter()
+                    .zip(intervals)
+                    .any(|(parameter, [low, high])| {
+                        parameter.search == Search::Logarithmic
+                            && !parameter.internal
+                            && *high > VAGUE * low
+                    })
+            });
+        let Some(index) = found else {
+            return;
+        };
+        selection.refused.push(format!(
+            "{}: fits, but this recording does not tell its values",
+            members[index].id()
+        ));
+        let without = fit::fit(bench, &selection.fit.model.without(index), None);
         selection.fit = fit::polish(bench, &without);
         selection.rename(bench);
     }
