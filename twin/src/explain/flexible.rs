@@ -252,7 +252,7 @@ fn columns(bench: &Workbench<'_>, rows: &[usize]) -> Vec<Vec<f64>> {
         let mean = there.iter().sum::<f64>() / there.len().max(1) as f64;
         let centred: Vec<f64> = there.iter().map(|v| v - mean).collect();
         let spread = (dot(&centred, &centred) / centred.len().max(1) as f64).sqrt();
-        if !(spread > 1e-9 * mean.abs().max(1.0)) {
+        if spread.is_nan() || spread <= 1e-9 * mean.abs().max(1.0) {
             continue;
         }
         push(centred.iter().map(|v| v * v / spread).collect());

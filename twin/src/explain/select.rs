@@ -370,11 +370,11 @@ fn obstacle(
         .collect();
     let largest = change.iter().fold(0.0f64, |most, c| most.max(c.abs()));
     let (mut from, mut to, mut changed, mut accuracy, mut rows) = (0.0, 0.0, 0.0, 0.0, 0.0);
-    for row in 0..change.len() {
-        if change[row].abs() >= ACTS * largest && largest > 0.0 {
+    for (row, change) in change.iter().enumerate() {
+        if change.abs() >= ACTS * largest && largest > 0.0 {
             from += before.residual[row].powi(2);
             to += after.residual[row].powi(2);
-            changed += change[row].powi(2);
+            changed += change.powi(2);
             let known = bench.problem.accuracy;
             accuracy += (known.zero + known.gain * bench.plain[row].abs()).powi(2);
             rows += 1.0;
