@@ -287,7 +287,9 @@ impl Work<'_> {
             base.range_limit = board.range_limit_a();
             base.range_ratio = board.range_ratio();
             base.window_s = board.conversion_s() * f64::from(board.average());
-            let reported = board.run(&drive, sensor.held_reference, &observed, pace, false);
+            let mut earlier = observed.clone();
+            earlier.t_s.iter_mut().for_each(|t| *t -= sensor.age_s);
+            let reported = board.run(&drive, sensor.held_reference, &earlier, pace, false);
             self.compare_range_flag(board, &mut drive, &observed, &reported.range_high);
             base.reading = reported.current_a;
             fresh = reported.fresh;
