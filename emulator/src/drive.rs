@@ -585,8 +585,7 @@ impl Sink {
             let Some(after) = self.samples.get(2) else {
                 return Ok(false);
             };
-            let bend_a =
-                after.current_a - 2.0 * next.current_a + self.samples[0].current_a;
+            let bend_a = after.current_a - 2.0 * next.current_a + self.samples[0].current_a;
             self.samples.pop_front();
             if bend_a.abs() > BEND_A && next.t_s < at_s {
                 self.row(next.t_s, &News::default(), false)?;
