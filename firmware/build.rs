@@ -20,8 +20,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         "cargo:rustc-env=HALLMARK_MODIFIED={}",
         if modified.is_empty() { "" } else { "1" }
     );
-    for file in ["../.git/HEAD", "../.git/index"] {
-        if fs::exists(file)? {
+    // Asked, not assumed: in a linked worktree `.git` is a file that names another folder.
+    for name in ["HEAD", "index"] {
+        if let Some(file) =
+            git(&["rev-parse", "--git-path", name]).filter(|file| fs::exists(file).unwrap_or(false))
+        {
             println!("cargo:rerun-if-changed={file}");
         }
     }

@@ -16,7 +16,8 @@
 //!
 //! **Stuck.** A run of identical codes is legal at rest. It is implausible when it is at least
 //! [`ConverterConfig::stuck_count`] long and the energy meter's mean current has meanwhile moved by more than
-//! [`ConverterConfig::stuck_movement`]. Without a meter nothing is said.
+//! [`ConverterConfig::stuck_movement`]. Without a meter nothing is said, nor by a mean that reaches back to another
+//! supply or calibration: with these the meter's factors move, and a ratiometric sensor's codes rightly stay.
 
 use serde::{Deserialize, Serialize};
 
@@ -519,6 +520,50 @@ pub struct ConverterSample {
     pub code: i16,
 }
 
+/// When the end of a conversion is asked for. Its oscillator keeps its time but for drift (ADS1100: within a tenth or so
+/// of the nominal one), and a question takes 0.1 ms of the bus: so first shortly before the time that the last one took.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct PollPace {
+    /// Data rate and first question of the last conversion, and when it was found at its end, in ms.
+    last: Option<(DataRate, u32, u32)>,
+    asked: Option<(DataRate, u32)>,
+}
+
+impl PollPace {
+    /// Milliseconds from the start of a conversion to the first question.
+    pub fn first_ms(&mut self, rate: DataRate) -> u32 {
+        let earliest = Self::period_ms(rate) * 4 / 5;
+        let first = match self.last {
+            // Found at the first question: it may have ended earlier.
+            Some((of, first, end)) if of == rate && end <= first => (end - 1).max(earliest),
+            Some((of, _, end)) if of == rate => end.max(earliest),
+            _ => earliest,
+        };
+        self.asked = Some((rate, first));
+        first
+    }
+
+    /// The last question: a conversion that has not ended by then never will.
+    #[must_use]
+    pub fn limit_ms(rate: DataRate) -> u32 {
+        Self::period_ms(rate) * 3 / 2 + 2
+    }
+
+    /// It was found at its end so long after its start.
+    pub fn ended(&mut self, at_ms: u32) {
+        self.last = self.asked.map(|(rate, first)| (rate, first, at_ms));
+    }
+
+    /// It did not end, or nobody knows.
+    pub fn unknown(&mut self) {
+        self.last = None;
+    }
+
+    fn period_ms(rate: DataRate) -> u32 {
+        u32::try_from(rate.period().as_millis()).unwrap_or(125)
+    }
+}
+
 /// A finished conversion of ADC1, for a front end there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -793,6 +838,14 @@ impl Converter {
         self.refused = Some((level, count));
         self.counters.steps_refused = self.counters.steps_refused.saturating_add(1);
         false
+    }
+
+    /// The meter counts by other factors from about `at` on: how its mean moves until then says nothing of the current.
+    pub fn forget_meter_until(&mut self, at: Instant) {
+        if let Some(run) = &mut self.run {
+            run.since = run.since.max(at);
+            run.meter = None;
+        }
     }
 
     /// The stuck rule of the module's description.
@@ -1432,6 +1485,48 @@ pub(crate) mod tests {
         bench.code(4_096);
         assert!(bench.code(4_098).validity.is_valid());
         assert!(!bench.code(4_101).validity.is_valid());
+    }
+
+    #[test]
+    fn a_conversion_is_asked_for_three_times_at_most_once_its_time_is_known() {
+        // 0.9 and 1.1 of the nominal time, drifting by 1 ms over 50 conversions.
+        for (rate, nominal_ms) in [
+            (DataRate::Sps32, 31.25),
+            (DataRate::Sps128, 7.8125),
+            (DataRate::Sps8, 125.0),
+        ] {
+            for share in [0.9, 1.0, 1.1] {
+                let mut pace = PollPace::default();
+                for turn in 0..50 {
+                    let length = nominal_ms * share + f64::from(turn) / 50.0;
+                    let first = pace.first_ms(rate);
+                    let mut at = first;
+                    while f64::from(at) < length {
+                        at += 1;
+                    }
+                    assert!(at <= PollPace::limit_ms(rate), "{rate:?} {share}");
+                    let questions = at - first + 1;
+                    assert!(
+                        turn == 0 || questions <= 3,
+                        "{rate:?} {share} {turn}: {questions}"
+                    );
+                    // Never found later than a millisecond after its end, but where it ends before anybody would ask.
+                    assert!(
+                        f64::from(at) < length + 1.0 || turn == 0 || questions == 1,
+                        "{rate:?} {share} {turn}: {at} {length}"
+                    );
+                    pace.ended(at);
+                }
+            }
+        }
+        let mut pace = PollPace::default();
+        pace.first_ms(DataRate::Sps32);
+        pace.ended(40);
+        assert_eq!(pace.first_ms(DataRate::Sps32), 40);
+        // Another rate, and a conversion that never ended, begin anew.
+        assert_eq!(pace.first_ms(DataRate::Sps128), 5);
+        pace.unknown();
+        assert_eq!(pace.first_ms(DataRate::Sps32), 24);
     }
 
     #[test]

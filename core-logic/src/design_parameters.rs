@@ -234,8 +234,9 @@ pub const FLAG_MARGIN_ABOVE: Microamps = Microamps::from_amps(3);
 pub const FLAG_MARGIN_BELOW: Microamps = Microamps::from_amps(8);
 /// Two readings of the small sensor by different converters agree within this (*assumed*: 5 % of its range).
 pub const FLAG_MATCH_TOLERANCE: Microamps = Microamps::from_amps(3);
-/// Time for which flag and level must contradict each other; with one conversion of 31 ms on top below 200 ms.
-pub const FLAG_DEBOUNCE_MS: u32 = 150;
+/// Time for which flag and level must contradict each other, three conversions of 31 ms; with the one that an edge falls
+/// into and the first one after it below 200 ms.
+pub const FLAG_DEBOUNCE_MS: u32 = 90;
 
 // ---------------------------------------------------------------------------------------------- charge at an edge
 

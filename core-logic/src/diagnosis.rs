@@ -348,9 +348,13 @@ impl CodeSet {
 
     /// The codes, lowest number first.
     pub fn iter(self) -> impl Iterator<Item = Code> {
-        Code::ALL
-            .into_iter()
-            .filter(move |code| self.contains(*code))
+        let mut left = self.0;
+        core::iter::from_fn(move || {
+            // 64 when nothing is left, which is no code's number.
+            let number = u8::try_from(left.trailing_zeros()).ok()?;
+            left &= left.wrapping_sub(1);
+            Code::from_number(number)
+        })
     }
 
     /// The code after `previous`, starting over at the end; the first one for `None`. For a frame that shows one code
@@ -431,10 +435,10 @@ impl Diagnosis {
     pub fn step(&mut self, now: Instant, conditions: CodeSet) -> Changes {
         let mut changes = Changes::default();
         let differing = conditions.difference(self.active);
-        for (code, entry) in Code::ALL.into_iter().zip(&mut self.entries) {
-            if !differing.contains(code) {
+        for code in differing.iter() {
+            let Some(entry) = self.entries.get_mut(usize::from(code.number())) else {
                 continue;
-            }
+            };
             if !self.pending.contains(code) {
                 entry.differs_since = now;
             }

@@ -24,7 +24,7 @@ use crate::design_parameters::SENSOR_ZERO;
 use crate::front_end::KeyFactors;
 use crate::range::Range;
 use crate::units::{
-    Duration, Instant, Microamps, Microvolts, clamp_i32, div_round, elapsed, mul_div,
+    Duration, Instant, Microamps, Microvolts, Nanocoulombs, clamp_i32, div_round, elapsed, mul_div,
 };
 
 /// The vehicle's key.
@@ -98,8 +98,8 @@ impl Default for KeyCalibrationConfig {
             max_delay_ms: 1_500,
             // One code of the ADS1100 at 32 conversions a second is 0.61 mV.
             max_spread: Microvolts::from_millivolts(2),
-            // D4's example moves the zero by 20 mV, 0.53 A of the small range.
-            max_current: Microamps::from_amps(2),
+            // D4's example moves the zero by 20 mV: 0.53 A of D0's small sensor, 3 A of D4's own (6.67 mV/A).
+            max_current: Microamps::from_milliamps(3_500),
             // D4's example: 0.4 %.
             max_k_deviation_ppm: 20_000,
             // D4's example: 10 mV.
@@ -139,6 +139,8 @@ pub struct KeyInputs {
     pub can_high_voltage: Option<bool>,
     /// The meter's mean current, when valid.
     pub meter_current: Option<Microamps>,
+    /// The meter's charge and when it was read, when valid.
+    pub meter_charge: Option<(Instant, Nanocoulombs)>,
     /// The newest conversion, if any.
     pub sample: Option<KeySample>,
 }
@@ -167,6 +169,8 @@ pub enum KeyRefusal {
     KOutOfLimits(i32),
     /// a would be this voltage.
     AOutOfLimits(Microvolts),
+    /// Ended by command.
+    Cancelled,
 }
 
 impl fmt::Display for KeyRefusal {
@@ -184,6 +188,7 @@ impl fmt::Display for KeyRefusal {
             Self::NoOffValue => write!(f, "no output was taken with key OFF"),
             Self::KOutOfLimits(ppm) => write!(f, "k is {ppm} ppm from one"),
             Self::AOutOfLimits(a) => write!(f, "a is {} µV", a.get()),
+            Self::Cancelled => write!(f, "ended by command"),
         }
     }
 }
@@ -269,6 +274,8 @@ struct Batch {
     sum: i64,
     lowest: i32,
     highest: i32,
+    /// The meter's charge when it began.
+    charge: Option<(Instant, Nanocoulombs)>,
 }
 
 impl Batch {
@@ -277,6 +284,7 @@ impl Batch {
         sum: 0,
         lowest: i32::MAX,
         highest: i32::MIN,
+        charge: None,
     };
 
     fn add(&mut self, voltage: Microvolts) {
@@ -284,6 +292,20 @@ impl Batch {
         self.sum += i64::from(voltage.get());
         self.lowest = self.lowest.min(voltage.get());
         self.highest = self.highest.max(voltage.get());
+    }
+
+    /// The mean current since it began: the meter's own mean may reach back to before.
+    fn current(&self, now: Option<(Instant, Nanocoulombs)>) -> Option<Microamps> {
+        let ((from, before), (to, after)) = (self.charge?, now?);
+        let time_us = i64::try_from(elapsed(from, to).as_ticks()).ok()?;
+        // nC per ms are µA.
+        (time_us > 0).then(|| {
+            Microamps(clamp_i32(mul_div(
+                after.saturating_sub(before).get(),
+                1_000,
+                time_us,
+            )))
+        })
     }
 
     fn spread(&self) -> Microvolts {
@@ -323,6 +345,18 @@ impl KeyCalibration {
     #[must_use]
     pub const fn factors(&self) -> KeyFactors {
         self.factors
+    }
+
+    /// Ends the taking of VC2 of this key cycle; whether it was under way. What follows is what follows on any failure.
+    /// With key OFF nothing is under way: VC1 is but kept up to date.
+    pub fn cancel(&mut self) -> bool {
+        let under_way = self.phase == KeyPhase::Taking;
+        if under_way {
+            self.phase = KeyPhase::Failed(KeyRefusal::Cancelled);
+            self.refusal = Some(KeyRefusal::Cancelled);
+            self.batch = Batch::EMPTY;
+        }
+        under_way
     }
 
     /// Looks at lines, CAN and samples. To be called at least as often as samples arrive.
@@ -466,6 +500,9 @@ impl KeyCalibration {
         if sample.range != Self::RANGE {
             return Err(KeyRefusal::WrongRange);
         }
+        if self.batch.count == 0 {
+            self.batch.charge = inputs.meter_charge;
+        }
         self.batch.add(voltage);
         if self.batch.count < config.samples {
             return Ok(None);
@@ -473,6 +510,11 @@ impl KeyCalibration {
         let batch = core::mem::replace(&mut self.batch, Batch::EMPTY);
         if batch.spread() > config.max_spread {
             return Err(KeyRefusal::Unstable(batch.spread()));
+        }
+        if let Some(current) = batch.current(inputs.meter_charge)
+            && current.saturating_abs() > config.max_current
+        {
+            return Err(KeyRefusal::CurrentFlows(current));
         }
         if self.phase == KeyPhase::Off {
             first_factor(config, batch.mean())?;
@@ -558,6 +600,8 @@ mod tests {
         /// Added to every other sample.
         ripple: i32,
         samples: u64,
+        /// By the meter's charge; its mean is what `inputs` says.
+        milliamps: i64,
     }
 
     impl Car {
@@ -573,12 +617,14 @@ mod tests {
                     can_key: None,
                     can_high_voltage: None,
                     meter_current: Some(Microamps::ZERO),
+                    meter_charge: None,
                     sample: None,
                 },
                 voltage: Some(D4_EXAMPLE_OFF),
                 range: Range::Small,
                 ripple: 0,
                 samples: 0,
+                milliamps: 0,
             }
         }
 
@@ -594,6 +640,13 @@ mod tests {
             while self.inputs.now.as_ticks() + CONVERSION <= end {
                 self.inputs.now = Instant::from_ticks(self.inputs.now.as_ticks() + CONVERSION);
                 self.samples += 1;
+                let charge = self
+                    .inputs
+                    .meter_charge
+                    .map_or(0, |(_, charge)| charge.get());
+                // mA · µs are nC.
+                let charge = charge + self.milliamps * CONVERSION.cast_signed();
+                self.inputs.meter_charge = Some((self.inputs.now, Nanocoulombs(charge)));
                 let ripple = if self.samples.is_multiple_of(2) {
                     self.ripple
                 } else {
@@ -809,12 +862,12 @@ mod tests {
                 KeyRefusal::Unstable(Microvolts(2_001)),
             ),
             (
-                |car| car.inputs.meter_current = Some(Microamps(2_000_001)),
-                KeyRefusal::CurrentFlows(Microamps(2_000_001)),
+                |car| car.inputs.meter_current = Some(Microamps(3_500_001)),
+                KeyRefusal::CurrentFlows(Microamps(3_500_001)),
             ),
             (
-                |car| car.inputs.meter_current = Some(Microamps(-2_000_001)),
-                KeyRefusal::CurrentFlows(Microamps(-2_000_001)),
+                |car| car.inputs.meter_current = Some(Microamps(-3_500_001)),
+                KeyRefusal::CurrentFlows(Microamps(-3_500_001)),
             ),
             (
                 |car| car.inputs.hv_feedback = true,
@@ -862,7 +915,7 @@ mod tests {
         // At the limits themselves, and without what is optional, they are taken.
         let good: [Change; 7] = [
             |car| car.ripple = 2_000,
-            |car| car.inputs.meter_current = Some(Microamps(-2_000_000)),
+            |car| car.inputs.meter_current = Some(Microamps(-3_500_000)),
             |car| car.inputs.meter_current = None,
             |car| car.inputs.can_high_voltage = Some(false),
             |car| car.inputs.can_key = Some(KeyState::Start),
@@ -874,6 +927,27 @@ mod tests {
             change(&mut car);
             assert!(car.run_ms(500).1.is_some());
         }
+    }
+
+    /// The meter's mean is that of a whole second, and the current began with the key.
+    #[test]
+    fn a_current_that_the_mean_does_not_show_yet_is_seen_by_the_charge() {
+        for milliamps in [-5_000, 5_000] {
+            let mut car = after_off(config());
+            car.inputs.acc_line = true;
+            car.milliamps = milliamps;
+            let (outputs, factors) = car.run_ms(2_000);
+            assert_eq!(factors, None);
+            let KeyPhase::Failed(KeyRefusal::CurrentFlows(current)) = outputs.phase else {
+                panic!("{:?}", outputs.phase);
+            };
+            assert_eq!(i64::from(current.get()), milliamps * 1_000);
+        }
+        // What the offset to be found makes of 0 A is none.
+        let mut car = after_off(config());
+        car.inputs.acc_line = true;
+        car.milliamps = -3_000;
+        assert!(car.run_ms(2_000).1.is_some());
     }
 
     #[test]
@@ -1168,6 +1242,8 @@ mod tests {
                     can_key: flags[2].then_some(KeyState::Acc),
                     can_high_voltage: None,
                     meter_current: current.map(Microamps),
+                    meter_charge: current
+                        .map(|charge| (Instant::from_ticks(now / 2), Nanocoulombs(i64::from(charge) << 31))),
                     sample: sample.map(|(voltage, at)| KeySample {
                         voltage: voltage.map(Microvolts),
                         range: if flags[3] { Range::Small } else { Range::Large },

@@ -24,7 +24,7 @@ use crate::design_parameters as design;
 use crate::diagnosis::{Changes, Code, CodeSet, Diagnosis, Effects};
 use crate::front_end::{Channel, FrontEnd, KeyFactors, PerRange, SupplyRelations};
 use crate::key_calibration::{
-    KeyCalibration, KeyInputs, KeyOutputs, KeyPhase, KeySample, KeyState,
+    KeyCalibration, KeyInputs, KeyOutputs, KeyPhase, KeyRefusal, KeySample, KeyState,
 };
 use crate::meter::{GapBridge, MeterConfig, MeterReport};
 use crate::modbus::readings::CommandState;
@@ -169,6 +169,23 @@ pub enum Refusal {
     SupplyCalibration = 13,
     /// The key is not OFF.
     KeyNotOff = 14,
+    /// Key line and CAN contradict each other.
+    KeyContradiction = 15,
+}
+
+impl From<KeyRefusal> for Refusal {
+    fn from(refusal: KeyRefusal) -> Self {
+        match refusal {
+            KeyRefusal::NoSamples | KeyRefusal::NoOffValue => Self::Timeout,
+            KeyRefusal::Unstable(_) => Self::Unstable,
+            KeyRefusal::CurrentFlows(_) => Self::CurrentFlows,
+            KeyRefusal::HighVoltageOn => Self::HighVoltage,
+            KeyRefusal::InvalidSample | KeyRefusal::WrongRange => Self::InvalidReading,
+            KeyRefusal::KeyContradiction => Self::KeyContradiction,
+            KeyRefusal::KOutOfLimits(_) | KeyRefusal::AOutOfLimits(_) => Self::BeyondLimit,
+            KeyRefusal::Cancelled => Self::Cancelled,
+        }
+    }
 }
 
 impl From<ZeroRefusal> for Refusal {
@@ -200,6 +217,11 @@ pub struct Tick {
 
 /// The supply is averaged over 2⁴ readings: one conversion of ADC1 is 1.6 mV of a 5 V supply.
 const SUPPLY_SHIFT: u32 = 4;
+/// A reading further than this from the mean is no noise: the mean begins anew there. Half a per cent, which the meter's
+/// scale would be wrong by for as long as the mean takes to follow; the converter's noise is a tenth of it.
+const SUPPLY_JUMP: Microvolts = Microvolts::from_millivolts(25);
+/// By then the meter counts with the factors that it is handed: a tick and a poll.
+const METER_FOLLOWS: Duration = Duration::from_ticks(50_000);
 /// Environment readings older than this are missing.
 const ENVIRONMENT_TIMEOUT: Duration = Duration::from_ticks(500_000);
 /// The first conversion is there by then: the chip's first result after power-up is discarded, and a conversion at
@@ -236,6 +258,8 @@ pub struct Measurement {
     compare: ChannelCompare,
     meter: MeterReport,
     meter_causes: Validity,
+    /// [`Measurement::meter_config`] is another one since it was taken.
+    meter_config_changed: bool,
     zero: ZeroCalibration,
     zero_beyond_limit: bool,
     sweep: Option<SupplyCalibration>,
@@ -254,7 +278,10 @@ pub struct Measurement {
     effects: Effects,
     found: Option<Found>,
     order_outcome: (CommandState, u16),
-    restored_with_loss: bool,
+    /// The newest order is a key-state calibration, and it has not ended.
+    key_ordered: bool,
+    /// Charge that the reset may have cost.
+    loss: Nanocoulombs,
     started: Instant,
     now: Instant,
 }
@@ -376,6 +403,25 @@ fn prepare(
     }
 }
 
+/// What the zero drift in force is at the sensor's output, rated supply: the key factors are taken of what it leaves, or
+/// the two would correct the same zero twice.
+fn zero_drift_voltage(configuration: &Configuration) -> Microvolts {
+    let output = |current: Microamps| {
+        configuration.front_end.voltage(
+            current,
+            KeyCalibration::RANGE,
+            design::SENSOR_NOMINAL_SUPPLY,
+        )
+    };
+    let drift = configuration.zero_drift.value.get(KeyCalibration::RANGE);
+    output(drift).saturating_sub(output(Microamps::ZERO))
+}
+
+/// When the meter counts by factors that change at `now`.
+fn meter_follows(now: Instant) -> Instant {
+    now.checked_add_duration(METER_FOLLOWS).unwrap_or(now)
+}
+
 impl Measurement {
     /// Starts, going on from `retained` where there is such a state. `loss` is the charge that the reset may have cost;
     /// zero after a clean restart.
@@ -392,8 +438,7 @@ impl Measurement {
             || Soc::new(&prepared.soc),
             |state| Soc::restore(&prepared.soc, &state.soc, state.charge_total),
         );
-        let restored_with_loss = loss != Nanocoulombs::ZERO;
-        if restored_with_loss {
+        if loss != Nanocoulombs::ZERO {
             soc.declare_loss(&prepared.soc, loss);
         }
         let mut measurement = Self {
@@ -413,6 +458,7 @@ impl Measurement {
             compare: ChannelCompare::new(),
             meter: MeterReport::default(),
             meter_causes: Validity::STALE,
+            meter_config_changed: true,
             zero: ZeroCalibration::new(),
             zero_beyond_limit: false,
             sweep: None,
@@ -439,7 +485,8 @@ impl Measurement {
             effects: Effects::default(),
             found: None,
             order_outcome: (CommandState::None, 0),
-            restored_with_loss,
+            key_ordered: false,
+            loss,
             started: now,
             now,
         };
@@ -453,11 +500,30 @@ impl Measurement {
     /// owner has to be handed [`Measurement::meter_config`] as well.
     pub fn configuration_changed(&mut self, configuration: &Configuration) {
         let before = self.prepared.soc;
-        self.prepared = prepare(configuration, self.key.factors(), self.prepared.supply);
+        let (factors, supply) = (self.key.factors(), self.prepared.supply);
+        self.prepare_again(configuration, factors, supply, self.now);
+        self.compare.restart_at(meter_follows(self.now));
         if before.capacity() != self.prepared.soc.capacity() {
             self.soc.change_capacity(&before, &self.prepared.soc);
         }
         self.soc_reading = self.soc.reading(&self.prepared.soc);
+    }
+
+    /// What the meter's owner has to count with, if that has changed since the last call.
+    pub fn changed_meter_config(&mut self, configuration: &Configuration) -> Option<MeterConfig> {
+        core::mem::take(&mut self.meter_config_changed).then(|| self.meter_config(configuration))
+    }
+
+    fn prepare_again(
+        &mut self,
+        configuration: &Configuration,
+        factors: KeyFactors,
+        supply: Option<Microvolts>,
+        now: Instant,
+    ) {
+        self.prepared = prepare(configuration, factors, supply);
+        self.meter_config_changed = true;
+        self.converter.forget_meter_until(meter_follows(now));
     }
 
     /// What the meter's owner has to count with.
@@ -506,7 +572,7 @@ impl Measurement {
     ) {
         self.environment = environment;
         self.environment_at = Some(now);
-        self.average_supply(configuration, environment.supply);
+        self.average_supply(configuration, environment.supply, now);
         let Some(network) = environment.network else {
             return;
         };
@@ -605,16 +671,29 @@ impl Measurement {
                 can_key: vehicle.can_key,
                 can_high_voltage: vehicle.can_high_voltage,
                 meter_current: self.meter_mean(),
+                meter_charge: self
+                    .meter
+                    .at
+                    .filter(|_| self.meter_causes.is_valid())
+                    .map(|at| (at, self.meter.charge_total)),
                 sample: (self.conversions > 0).then_some(KeySample {
-                    voltage: measured.then_some(self.reading.volts),
+                    voltage: measured.then(|| {
+                        self.reading
+                            .volts
+                            .saturating_sub(zero_drift_voltage(configuration))
+                    }),
                     range: self.reading.range,
                     at: self.reading.at,
                 }),
             },
         );
         if let Some(factors) = self.key_outputs.new_factors {
-            self.prepared = prepare(configuration, factors, self.prepared.supply);
+            self.prepare_again(configuration, factors, self.prepared.supply, now);
+            self.compare.restart_at(meter_follows(now));
             self.found = Some(Found::KeyFactors(factors));
+        }
+        if self.key_ordered {
+            self.follow_key_order();
         }
         if let Some(refusal) = self.zero.tick(&configuration.zero_drift, now) {
             self.fail(refusal.into());
@@ -636,7 +715,10 @@ impl Measurement {
     /// Why it was not even begun.
     pub fn order(&mut self, configuration: &Configuration, order: Order) -> Result<(), Refusal> {
         let result = self.begin(configuration, order);
+        // The state is that of the newest order.
+        self.key_ordered = order == Order::KeyCalibration && result.is_ok();
         match result {
+            Ok(CommandState::Failed) => self.fail(Refusal::Cancelled),
             Ok(state) => self.order_outcome = (state, 0),
             Err(refusal) => self.fail(refusal),
         }
@@ -645,7 +727,20 @@ impl Measurement {
 
     /// Notes the outcome of a command that others carry out (save, restore, clear log).
     pub fn note_command(&mut self, state: CommandState, reason: u16) {
+        self.key_ordered = false;
         self.order_outcome = (state, reason);
+    }
+
+    /// An ordered key-state calibration ends with the key cycle that it waits for.
+    fn follow_key_order(&mut self) {
+        match self.key_outputs.phase {
+            KeyPhase::Off | KeyPhase::Taking => return,
+            KeyPhase::Taken => self.order_outcome = (CommandState::Done, 0),
+            KeyPhase::Failed(refusal) => self.fail(refusal.into()),
+            KeyPhase::Resumed => self.fail(Refusal::HighVoltage),
+            KeyPhase::Disabled => self.fail(Refusal::Disabled),
+        }
+        self.key_ordered = false;
     }
 
     fn begin(
@@ -700,7 +795,10 @@ impl Measurement {
                 Ok(CommandState::Done)
             }
             Order::Abort => {
-                let ended = self.zero.cancel().is_some() | self.sweep.take().is_some();
+                let ended = self.zero.cancel().is_some()
+                    | self.sweep.take().is_some()
+                    | self.key.cancel()
+                    | self.key_ordered;
                 Ok(if ended {
                     CommandState::Failed
                 } else {
@@ -829,27 +927,28 @@ impl Measurement {
         {
             return;
         }
-        let own = self
-            .environment
-            .network
-            .filter(|_| !self.open_sensor.finding(Range::Small).is_fault())
-            .map(|volts| {
-                let hall = hall_voltage(volts);
-                let supply = self
-                    .prepared
-                    .supply
-                    .unwrap_or(design::SENSOR_NOMINAL_SUPPLY);
-                let rated = mul_div(
-                    i64::from(hall.get()),
-                    i64::from(design::SENSOR_NOMINAL_SUPPLY.get()),
-                    i64::from(supply.get()),
-                );
-                configuration.front_end.current(
-                    Microvolts(clamp_i32(rated)),
-                    Range::Small,
-                    design::SENSOR_NOMINAL_SUPPLY,
-                )
-            });
+        if self.open_sensor.finding(Range::Small).is_fault() {
+            // The large sensor is in use whatever the current, and rightly so.
+            self.flag = self.flag_plausibility.rest();
+            return;
+        }
+        let own = self.environment.network.map(|volts| {
+            let hall = hall_voltage(volts);
+            let supply = self
+                .prepared
+                .supply
+                .unwrap_or(design::SENSOR_NOMINAL_SUPPLY);
+            let rated = mul_div(
+                i64::from(hall.get()),
+                i64::from(design::SENSOR_NOMINAL_SUPPLY.get()),
+                i64::from(supply.get()),
+            );
+            configuration.front_end.current(
+                Microvolts(clamp_i32(rated)),
+                Range::Small,
+                design::SENSOR_NOMINAL_SUPPLY,
+            )
+        });
         self.flag = self.flag_plausibility.step(
             &configuration.flag,
             &FlagObservation {
@@ -862,16 +961,23 @@ impl Measurement {
         );
     }
 
-    /// A mean over some conversions of ADC1; a jump beyond half a volt is taken at once.
-    fn average_supply(&mut self, configuration: &Configuration, supply: Option<Microvolts>) {
+    /// A mean over some conversions of ADC1; a jump beyond [`SUPPLY_JUMP`] is taken at once.
+    fn average_supply(
+        &mut self,
+        configuration: &Configuration,
+        supply: Option<Microvolts>,
+        now: Instant,
+    ) {
         let mean = supply.map(|supply| {
-            let now = i64::from(supply.get());
-            let sum = match self.supply_sum {
-                Some(sum) if ((sum >> SUPPLY_SHIFT) - now).abs() < 500_000 => {
-                    sum - (sum >> SUPPLY_SHIFT) + now
-                }
-                _ => now << SUPPLY_SHIFT,
-            };
+            let new = i64::from(supply.get());
+            let follows = self
+                .supply_sum
+                .filter(|sum| ((sum >> SUPPLY_SHIFT) - new).abs() < i64::from(SUPPLY_JUMP.get()));
+            let sum = follows.map_or(new << SUPPLY_SHIFT, |sum| sum - (sum >> SUPPLY_SHIFT) + new);
+            if follows.is_none() {
+                // Converter and sensor are there before the meter's factors are.
+                self.compare.restart_at(meter_follows(now));
+            }
             self.supply_sum = Some(sum);
             Microvolts(clamp_i32(sum >> SUPPLY_SHIFT))
         });
@@ -884,7 +990,7 @@ impl Measurement {
             (new, old) => new.is_some() != old.is_some(),
         };
         if moved {
-            self.prepared = prepare(configuration, self.key.factors(), mean);
+            self.prepare_again(configuration, self.key.factors(), mean, now);
         }
     }
 
@@ -996,7 +1102,10 @@ impl Measurement {
             ),
             (Code::CellVoltageMissing, !self.vehicle.voltage_fresh),
             (Code::VehicleStateMissing, !self.vehicle.state_fresh),
-            (Code::ChargeRestoredWithLoss, self.restored_with_loss),
+            (
+                Code::ChargeRestoredWithLoss,
+                self.loss != Nanocoulombs::ZERO,
+            ),
         ];
         let mut set = CodeSet::EMPTY;
         for (code, present) in rows {
@@ -1013,6 +1122,11 @@ impl Measurement {
                 || self.key_outputs.phase == KeyPhase::Taking,
             Validity::CALIBRATING,
         )
+    }
+
+    /// The meter's own, and what the reset may have cost.
+    const fn charge_uncertainty(&self) -> Nanocoulombs {
+        self.meter.uncertainty.saturating_add(self.loss)
     }
 
     fn charge_validity(&self) -> Validity {
@@ -1074,7 +1188,7 @@ impl Measurement {
         can::Charge {
             charge: self.meter.charge_total,
             validity: self.charge_validity(),
-            estimated: self.restored_with_loss
+            estimated: self.loss != Nanocoulombs::ZERO
                 || self.meter.estimated_intervals > 0
                 || self.meter.gaps > 0,
         }
@@ -1089,7 +1203,7 @@ impl Measurement {
                 .charge_validity()
                 .and_if(self.meter.mean_over.is_zero(), Validity::STALE),
             below_no_load: self.meter.below_no_load,
-            charge_uncertainty: Some(self.meter.uncertainty),
+            charge_uncertainty: Some(self.charge_uncertainty()),
         }
     }
 
@@ -1246,7 +1360,7 @@ impl Measurement {
         readings.charge = self.meter.charge_total;
         readings.charge_in = self.meter.charge_in;
         readings.charge_out = self.meter.charge_out;
-        readings.charge_uncertainty = self.meter.uncertainty;
+        readings.charge_uncertainty = self.charge_uncertainty();
         readings.estimated_intervals = self.meter.estimated_intervals;
         if let Outcome::Disagree { difference, bound } = compared.slow {
             (readings.channel_difference, readings.channel_bound) = (difference, bound);

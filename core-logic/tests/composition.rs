@@ -497,8 +497,114 @@ fn a_zero_calibration_reports_progress_ends_and_can_be_aborted() {
     assert_eq!(bench.readings().command_reason, Refusal::Timeout as u16);
 }
 
+/// The command of a key-state calibration ends with the key cycle that it waits for.
 #[test]
-fn every_reason_against_a_zero_has_its_number() {
+fn an_ordered_key_calibration_ends_as_done_or_failed() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(1_500);
+    assert_eq!(bench.order(Order::KeyCalibration), Ok(()));
+    bench.run_ms(2_000);
+    let state = |bench: &Bench| {
+        let readings = bench.readings();
+        (readings.command_state, readings.command_reason)
+    };
+    assert_eq!(state(&bench), (CommandState::Running, 0));
+    bench.vehicle.acc_line = true;
+    bench.run_ms(300);
+    assert_eq!(state(&bench), (CommandState::Running, 0));
+    bench.run_ms(1_500);
+    assert_eq!(bench.readings().key_calibration_state, 2);
+    assert_eq!(state(&bench), (CommandState::Done, 0));
+
+    // A current flows until the delay has passed.
+    bench.vehicle.acc_line = false;
+    bench.run_ms(1_500);
+    assert_eq!(bench.order(Order::KeyCalibration), Ok(()));
+    bench.run_ms(1_500);
+    bench.report.mean_current = Microamps::from_amps(10);
+    bench.vehicle.acc_line = true;
+    bench.run_ms(2_000);
+    assert_eq!(bench.readings().key_calibration_state, 3);
+    assert_eq!(
+        state(&bench),
+        (CommandState::Failed, Refusal::CurrentFlows as u16)
+    );
+
+    // The state is that of the newest order: what an older one comes to does not change it.
+    bench.report.mean_current = Microamps::ZERO;
+    bench.vehicle.acc_line = false;
+    bench.run_ms(1_500);
+    assert_eq!(bench.order(Order::KeyCalibration), Ok(()));
+    bench.measurement.note_command(CommandState::Failed, 3);
+    bench.vehicle.acc_line = true;
+    bench.run_ms(2_000);
+    assert_eq!(state(&bench), (CommandState::Failed, 3));
+}
+
+/// Zero drift (D2) and key factors (D4) share the work: what the one has taken off, the other does not take off again.
+#[test]
+fn zero_drift_and_key_factors_together_read_0_a() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.code = 4_096 + 61; // 1 A at rest
+    bench.run_ms(1_500);
+    assert_eq!(bench.order(Order::ZeroNow), Ok(()));
+    bench.run_ms(3_000);
+    assert_eq!(bench.readings().command_state, CommandState::Done);
+    bench.vehicle.acc_line = true;
+    bench.code = 4_096 + 61 + 30; // 0.5 A more with the accessories on
+    bench.run_ms(2_000);
+    assert_eq!(bench.readings().key_calibration_state, 2);
+    let current = bench.measurement.current();
+    assert!(
+        current.current.saturating_abs() < Microamps(20_000),
+        "{current:?}"
+    );
+    // The next key cycle takes the same.
+    bench.vehicle.acc_line = false;
+    bench.code = 4_096 + 61;
+    bench.run_ms(2_000);
+    bench.vehicle.acc_line = true;
+    bench.run_ms(2_000);
+    assert!(bench.measurement.current().current.saturating_abs() < Microamps(20_000));
+}
+
+#[test]
+fn abort_ends_a_key_calibration_too() {
+    let cancelled = (CommandState::Failed, Refusal::Cancelled as u16);
+    let mut bench = Bench::new(Configuration::default());
+    let state = |bench: &Bench| {
+        let readings = bench.readings();
+        (readings.command_state, readings.command_reason)
+    };
+    bench.run_ms(1_500);
+    // Ordered, and still waiting for the key.
+    assert_eq!(bench.order(Order::KeyCalibration), Ok(()));
+    assert_eq!(bench.order(Order::Abort), Ok(()));
+    assert_eq!(state(&bench), cancelled);
+    // While it takes ACC's output: the previous factors stay, and the permit does not wait any longer.
+    let before = bench.configuration.key_factors;
+    bench.code = 4_100;
+    bench.run_ms(1_500);
+    bench.code = 4_096;
+    bench.vehicle.acc_line = true;
+    bench.run_ms(300);
+    assert_eq!(bench.readings().activity, Activity::KeyCalibration);
+    assert!(!bench.tick.unwrap().hv_permit);
+    assert_eq!(bench.order(Order::Abort), Ok(()));
+    assert_eq!(state(&bench), cancelled);
+    bench.run_ms(2_000);
+    assert_eq!(bench.readings().activity, Activity::None);
+    assert_eq!(bench.configuration.key_factors, before);
+    assert!(bench.tick.unwrap().hv_permit);
+    assert!(bench.has(Code::KeyCalibrationFailed));
+    assert!(bench.measurement.current().validity.is_valid());
+    // Nothing is left to abort.
+    assert_eq!(bench.order(Order::Abort), Ok(()));
+    assert_eq!(state(&bench), (CommandState::Done, 0));
+}
+
+#[test]
+fn every_reason_against_a_calibration_has_its_number() {
     use core_logic::zero_drift::ZeroRefusal as Zero;
     let microamps = Microamps(1);
     for (zero, number) in [
@@ -519,6 +625,23 @@ fn every_reason_against_a_zero_has_its_number() {
         (Zero::Cancelled, 9),
     ] {
         assert_eq!(Refusal::from(zero) as u16, number);
+    }
+    use core_logic::key_calibration::KeyRefusal as Key;
+    let microvolts = Microvolts(1);
+    for (key, number) in [
+        (Key::HighVoltageOn, 2),
+        (Key::CurrentFlows(microamps), 3),
+        (Key::InvalidSample, 5),
+        (Key::WrongRange, 5),
+        (Key::Unstable(microvolts), 6),
+        (Key::KOutOfLimits(1), 7),
+        (Key::AOutOfLimits(microvolts), 7),
+        (Key::NoSamples, 8),
+        (Key::NoOffValue, 8),
+        (Key::Cancelled, 9),
+        (Key::KeyContradiction, 15),
+    ] {
+        assert_eq!(Refusal::from(key) as u16, number);
     }
 }
 
@@ -678,6 +801,11 @@ fn what_is_kept_over_a_reset_goes_on() {
     let lost = Nanocoulombs::from_milliamp_hours(i64::from(configuration.soc.capacity_mah) / 10);
     let mut lossy = Measurement::new(&configuration, Some(&kept), lost, start);
     assert!(lossy.charge().estimated);
+    assert_eq!(lossy.meter_current().charge_uncertainty, Some(lost));
+    assert_eq!(
+        clean.meter_current().charge_uncertainty,
+        Some(Nanocoulombs::ZERO)
+    );
     let grown =
         lossy.state_of_charge().uncertainty.unwrap().get() - before.uncertainty.unwrap().get();
     assert!((grown - 100_000).abs() < 10, "{grown}");
@@ -745,19 +873,82 @@ fn surroundings_are_sent_with_their_validity() {
     bench.run_ms(1_500);
     assert!(bench.has(Code::TemperatureOutOfRange));
     // A supply that jumps is believed at once, one that wanders is averaged.
-    bench.environment.supply = Some(Microvolts::from_millivolts(5_400));
+    bench.environment.supply = Some(Microvolts::from_millivolts(5_020));
     bench.run_ms(10);
-    assert!(bench.measurement.environment().supply < Millivolts(5_100));
+    assert!(bench.measurement.environment().supply < Millivolts(5_005));
     bench.run_ms(1_000);
     // Factors are worked out anew per millivolt.
     let supply = bench.measurement.environment().supply;
     assert!(
-        (Millivolts(5_399)..=Millivolts(5_400)).contains(&supply),
+        (Millivolts(5_019)..=Millivolts(5_020)).contains(&supply),
         "{supply:?}"
     );
     bench.environment.supply = Some(Microvolts::from_millivolts(4_600));
     bench.run_ms(10);
     assert_eq!(bench.measurement.environment().supply, Millivolts(4_600));
+}
+
+/// The meter's factors follow configuration and supply, and its mean with them; the codes rightly stay.
+#[test]
+fn a_mean_that_moves_by_other_factors_makes_no_converter_stuck() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(2_000);
+    bench
+        .configuration
+        .zero_drift
+        .value
+        .set(Range::Small, Microamps::from_amps(2));
+    bench
+        .measurement
+        .configuration_changed(&bench.configuration);
+    assert!(
+        bench
+            .measurement
+            .changed_meter_config(&bench.configuration)
+            .is_some()
+    );
+    assert_eq!(
+        bench.measurement.changed_meter_config(&bench.configuration),
+        None
+    );
+    // The meter has its new factors a poll later.
+    bench.run_ms(30);
+    bench.report.mean_current = Microamps::from_amps(-2);
+    bench.run_ms(1_500);
+    assert!(!bench.has(Code::ConverterStuck));
+    // Over the supply's range, which moves the meter's mean by 10 %.
+    for millivolts in (4_550..5_000).rev() {
+        bench.environment.supply = Some(Microvolts::from_millivolts(millivolts));
+        bench.report.mean_current = Microamps(-2_000_000 - (5_000 - millivolts) * 4_000);
+        bench.run_ms(10);
+        assert!(!bench.has(Code::ConverterStuck), "{millivolts} mV");
+    }
+    bench.run_ms(1_500);
+    assert!(!bench.has(Code::ConverterStuck));
+    // By nothing but itself it is the converter's fault.
+    bench.report.mean_current = Microamps::from_amps(2);
+    bench.run_ms(100);
+    assert!(bench.has(Code::ConverterStuck));
+}
+
+/// With the small sensor open the large one is right at any current: no contradiction to the flag.
+#[test]
+fn the_large_sensor_in_the_small_ones_place_is_no_implausible_flag() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(500);
+    bench.range = Range::Large;
+    bench.code = 4_096 + 123; // 20 A by the large sensor
+    bench.environment.network = Some(network_output_open());
+    bench.report.mean_current = Microamps::from_amps(20);
+    bench.run_ms(500);
+    assert!(bench.has(Code::SmallSensorOpen) && !bench.has(Code::FlagImplausible));
+    let sent = bench.measurement.current();
+    assert!(sent.validity.is_valid(), "{:?}", sent.validity);
+    assert!((sent.current.get() - 20_000_000).abs() < 200_000);
+    // The sensor is back, and the flag is not: now it contradicts.
+    bench.environment.network = Some(network_output(Microvolts(2_500_000 + 750_000)));
+    bench.run_ms(2_000);
+    assert!(bench.has(Code::FlagImplausible) && !bench.has(Code::SmallSensorOpen));
 }
 
 #[test]

@@ -7,6 +7,7 @@ use plant::ads1100::Ads1100;
 use plant::bus::{SpiByte, SpiDevice};
 use plant::front_end::{Conditions, FrontEnd, FrontEndConfig};
 use plant::stretch::{Linear, Stretch};
+use plant::supply::SupplyProfile;
 use plant::w25q32::W25q32;
 
 use crate::can_frame::CanFrame;
@@ -133,6 +134,8 @@ pub struct Board {
     pub irq_fault: LineFault,
     /// The range flag's line towards the MCU (the switch follows the comparators all the same).
     pub flag_fault: LineFault,
+    /// The 5 V of sensors and converter over time, in place of the scenario's.
+    pub supply: Option<SupplyProfile>,
     meter_v2_v: f64,
     step: Ticks,
     row: Row,
@@ -187,7 +190,7 @@ fn conditions(row: &Row, closed: bool) -> Conditions {
         sensor_supply_v: row.sensor_supply_v,
         converter_supply_v: row.converter_supply_v,
         aux_current_a: row.aux_current_a,
-        ..Conditions::default()
+        output_shift_v: row.output_shift_v,
     }
 }
 
@@ -215,6 +218,7 @@ impl Board {
             line: Rs485Line::new(LineConfig::default()),
             irq_fault: LineFault::None,
             flag_fault: LineFault::None,
+            supply: None,
             meter_v2_v: config.meter_v2_v,
             step: config.step,
             row,
@@ -278,6 +282,11 @@ impl Board {
         }
         let end_s = end.seconds();
         self.row = self.scenario.at(end_s, false);
+        if let Some(supply) = &self.supply {
+            let volts = supply.at(end_s);
+            self.row.sensor_supply_v = volts;
+            self.row.converter_supply_v = volts;
+        }
         let permitted = self.outputs.driven(pins::PERMIT) == Some(true);
         let closed = self.scenario.permit(permitted, self.row.key, start_s);
         let conditions = conditions(&self.row, closed);

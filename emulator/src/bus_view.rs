@@ -208,10 +208,16 @@ impl BusView {
 
     /// The codes that the newest `DiagnosisActive` has set, by their names in `core_logic::diagnosis`.
     pub fn active_diagnoses(&self) -> Vec<&'static str> {
-        let Some((_, payload)) = self
-            .payloads
-            .get(&u32::from(layout::diagnosis_active::HEADER.id))
-        else {
+        self.codes(&layout::diagnosis_active::HEADER)
+    }
+
+    /// The same of the newest `DiagnosisLatched`.
+    pub fn latched_diagnoses(&self) -> Vec<&'static str> {
+        self.codes(&layout::diagnosis_latched::HEADER)
+    }
+
+    fn codes(&self, header: &layout::Header) -> Vec<&'static str> {
+        let Some((_, payload)) = self.payloads.get(&u32::from(header.id)) else {
             return Vec::new();
         };
         let word = layout::word(*payload);

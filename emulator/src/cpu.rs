@@ -561,6 +561,12 @@ impl Cpu {
         self.core.regs()
     }
 
+    /// Puts other values into the core registers (a fault, a debugger).
+    pub fn set_registers(&mut self, registers: Regs) {
+        self.core.set_regs(registers);
+        self.refresh();
+    }
+
     /// S0 … S31 as bits, then FPSCR.
     pub fn float_registers(&self) -> ([u32; 32], u32) {
         let mut registers = [0; 32];

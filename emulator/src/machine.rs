@@ -15,6 +15,7 @@ use crate::mcu::adc::Adc1;
 use crate::mcu::iwdg::Iwdg;
 use crate::mcu::rcc::{Rcc, ResetCause};
 use crate::mcu::system_bus::{Failure, SystemBus};
+use crate::mcu::tim2::Tim2;
 use crate::mcu::{Unmodelled, system_memory};
 use crate::outside::PORTS;
 use crate::rtt::{Log, Memory};
@@ -266,6 +267,11 @@ impl<'table> Machine<'table> {
         self.bus.with_can(work)
     }
 
+    /// Works on TIM2, which gives the image its time in µs.
+    pub fn timer<T>(&mut self, work: impl FnOnce(&mut Tim2) -> T) -> T {
+        self.bus.with_timer(work)
+    }
+
     /// Works on ADC1.
     pub fn adc<T>(&mut self, work: impl FnOnce(&mut Adc1) -> T) -> T {
         self.bus.with_adc(work)
@@ -284,6 +290,11 @@ impl<'table> Machine<'table> {
     /// The core, for diagnosis.
     pub const fn cpu(&self) -> &Cpu {
         &self.cpu
+    }
+
+    /// The core, to be disturbed.
+    pub const fn cpu_mut(&mut self) -> &mut Cpu {
+        &mut self.cpu
     }
 
     /// A word of the MCU's RAM, as a probe would read it; `None` outside.

@@ -14,9 +14,11 @@ use recording::Mapping;
 use serde_json::json;
 
 use emulator::drive::{self, Drive, Figures};
+use emulator::faults;
 use emulator::profile::{self, Profile, ProfileOptions};
 use emulator::rig::{self, Firmware, Setup};
 use emulator::scenario::{Contactors, Key, Row, Scenario};
+use emulator::sensors;
 use emulator::serve;
 use emulator::time::Ticks;
 
@@ -33,18 +35,32 @@ enum Command {
     /// Drive the board and write down what it does
     #[command(after_help = DRIVE_EXAMPLES)]
     Drive(Box<DriveArguments>),
+    /// Measure the board's figures: latencies, periods, charge errors; exit code 1 if one is beyond its bound
+    Bench {
+        /// The image; without it the one that `cargo xtask build` made last
+        #[arg(long, value_name = "ELF")]
+        image: Option<PathBuf>,
+        /// Half a minute of the drive instead of an hour
+        #[arg(long)]
+        quick: bool,
+    },
 }
 
 const DRIVE_EXAMPLES: &str = "\
 Examples:
-  emulate drive --profile recordings/panasonic-18650pf/25c-us06.csv --scale 19 --duration 600 --out target/emulate
-  emulate drive --profile drive.csv --map i_ref_a=Shunt --map v_cell_v=Ucell --check
-  emulate drive --serve                    a parked car for python-can and a Modbus client
-  emulate drive --serve --profile drive.csv --scale 19
+  cargo xtask emulate --profile recordings/panasonic-18650pf/25c-us06.csv --scale 19 --duration 600
+  cargo xtask emulate --profile drive.csv --map i_ref_a=Shunt --map v_cell_v=Ucell --check
+  cargo xtask emulate --profile drive.csv --sensor large.gain=1.02 --sensor both.tc_a_per_k=0.02
+  cargo xtask emulate --profile drive.csv --fault F9 --fault F21@7.5 --fault F14:open,large@10
+  cargo xtask emulate --serve                    a parked car for python-can and a Modbus client
+  cargo xtask emulate --serve --profile drive.csv --scale 19
 
 A profile needs t_s and i_ref_a (positive = discharge, at most ±600 A after scaling). temp_sensor_c, v_supply_v, i_aux_a,
 v_cell_v, v_pack_v, temp_cell_c and key (0 off, 1 accessory, 2 on) are used where they are.
---out gets can.log (candump -L), board.csv (the board beside the truth), rs485.log, defmt.log, summary.txt, summary.json.";
+--out gets can.log (candump -L), board.csv (the board beside the truth), rs485.log, defmt.log, summary.txt, summary.json;
+with `cargo xtask emulate` it is target/emulate, or nothing with --serve. docs/emulator.md tells more.
+
+Exit code 0: done; 1: --check found something, or the image did what the emulated board lacks; 2: bad input.";
 
 #[derive(Args, Debug)]
 struct DriveArguments {
@@ -52,7 +68,7 @@ struct DriveArguments {
     #[arg(long, value_name = "ELF")]
     image: Option<PathBuf>,
     /// The recorded drive
-    #[arg(long, value_name = "CSV", required_unless_present = "serve")]
+    #[arg(long, value_name = "CSV", required_unless_present_any = ["serve", "list_faults"])]
     profile: Option<PathBuf>,
     /// Calls a column of the profile by another name
     #[arg(long, value_name = "NAME=COLUMN", requires = "profile")]
@@ -75,6 +91,16 @@ struct DriveArguments {
     /// Seed of whatever is random: noise, bit errors, what a loss of power leaves
     #[arg(long, value_name = "NUMBER", default_value_t = 0)]
     seed: u64,
+    /// Puts a fault into the board, such as F9, F9:10kHz,30% or F9@2.5 (in s after power-on, else 2); may be given repeatedly
+    #[arg(long, value_name = "FAULT")]
+    fault: Vec<String>,
+    /// Changes a sensor, and the firmware does not know: large.gain=1.01, both.offset_a=-0.5, small.core.remanence_a=0.4; may be
+    /// given repeatedly
+    #[arg(long, value_name = "SENSOR.PARAMETER=VALUE")]
+    sensor: Vec<String>,
+    /// Lists the faults with their parameters, and ends
+    #[arg(long)]
+    list_faults: bool,
     /// Folder for what is written down; without it nothing is
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
@@ -160,6 +186,7 @@ fn main() -> ExitCode {
     let CommandLine { command } = CommandLine::parse();
     let result = match command {
         Command::Drive(arguments) => drive(&arguments),
+        Command::Bench { image, quick } => bench(image, quick),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -170,8 +197,33 @@ fn main() -> ExitCode {
     }
 }
 
+fn bench(image: Option<PathBuf>, quick: bool) -> Result<(), Failure> {
+    let path = image.unwrap_or_else(rig::default_image);
+    let firmware = Firmware::load(&path).map_err(|error| Failure::Input(format!("{error:#}")))?;
+    let figures = emulator::bench::run(&firmware, quick)?;
+    print!("{}", emulator::bench::Table(&figures));
+    let missed = figures.iter().filter(|figure| !figure.holds()).count();
+    if missed > 0 {
+        return Err(Failure::Check(format!(
+            "{missed} figures are beyond their bounds"
+        )));
+    }
+    Ok(())
+}
+
 /// Everything about the input is checked before a file is begun.
 fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
+    if arguments.list_faults {
+        for fault in faults::CATALOGUE {
+            println!("{:<5}{}: {}", fault.id, fault.title, fault.parameters);
+        }
+        return Ok(());
+    }
+    let injections = arguments
+        .fault
+        .iter()
+        .map(|text| faults::parse(text).map_err(|error| Failure::Input(error.to_string())))
+        .collect::<Result<Vec<_>, _>>()?;
     let path = arguments.image.clone().unwrap_or_else(rig::default_image);
     let firmware = Firmware::load(&path).map_err(|error| Failure::Input(format!("{error:#}")))?;
     let profile = arguments
@@ -188,6 +240,9 @@ fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
         .map_err(|error| Failure::Input(format!("listening for Ctrl-C: {error}")))?;
 
     let mut drive = Drive::new(&firmware, setup, arguments.out.as_deref())?;
+    for injection in &injections {
+        faults::apply(injection, &mut drive.rig);
+    }
     if arguments.serve {
         if arguments.profile.is_none() {
             // The clients are the other nodes.
@@ -255,6 +310,10 @@ fn setup(arguments: &DriveArguments, profile: Option<Profile>) -> Result<Setup, 
     };
     let mut setup = Setup::nominal(scenario);
     setup.board.step = Ticks::from_micros(arguments.step);
+    for text in &arguments.sensor {
+        sensors::change(&mut setup.board.front_end.sensors, text)
+            .map_err(|error| Failure::Input(error.to_string()))?;
+    }
     // Different numbers, so that no two sources of noise are the same.
     let seed = |number: u64| arguments.seed.wrapping_mul(16).wrapping_add(number);
     setup.converter.seed = seed(0);
@@ -279,6 +338,8 @@ fn report(arguments: &DriveArguments, figures: &Figures) -> serde_json::Result<S
             "lead_s": arguments.lead,
             "step_us": arguments.step,
             "seed": arguments.seed,
+            "faults": arguments.fault,
+            "sensor": arguments.sensor,
             "served": arguments.serve,
         },
         "figures": figures,

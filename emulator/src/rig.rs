@@ -1,5 +1,6 @@
 //! The board on a test bench: machine, what its buses carry, and a client on RS485.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use anyhow::{Context as _, Result, bail};
@@ -92,6 +93,9 @@ impl Setup {
     }
 }
 
+/// Something that happens to the board at a set time.
+type Action = Box<dyn FnOnce(&mut Rig<'_>)>;
+
 /// The running board with its observers.
 pub struct Rig<'firmware> {
     /// The MCU.
@@ -106,6 +110,9 @@ pub struct Rig<'firmware> {
     pub frames: Vec<LoggedFrame>,
     /// Whether frames are kept.
     pub keep_frames: bool,
+    /// By time and order.
+    actions: BTreeMap<(Ticks, u64), Action>,
+    ordered: u64,
 }
 
 /// Observers are served this often.
@@ -136,6 +143,8 @@ impl<'firmware> Rig<'firmware> {
             log: Vec::new(),
             frames: Vec::new(),
             keep_frames: false,
+            actions: BTreeMap::new(),
+            ordered: 0,
         })
     }
 
@@ -165,13 +174,45 @@ impl<'firmware> Rig<'firmware> {
     /// # Errors
     /// As [`Machine::run_until`].
     pub fn run_to(&mut self, end: Ticks) -> Result<()> {
+        self.act();
         while self.machine.now() < end {
-            let slice = (self.machine.now() + SLICE).min(end);
+            let mut slice = (self.machine.now() + SLICE).min(end);
+            if let Some(((due, _), _)) = self.actions.first_key_value() {
+                slice = slice.min(*due);
+            }
             let result = self.machine.run_until(slice);
             self.observe();
             result?;
+            self.act();
         }
         Ok(())
+    }
+
+    /// Has something happen at `at`, or at once if that has passed; what has the same time happens in the order of the calls.
+    pub fn at(&mut self, at: Ticks, action: impl FnOnce(&mut Rig<'_>) + 'static) {
+        self.ordered += 1;
+        self.actions.insert((at, self.ordered), Box::new(action));
+    }
+
+    fn act(&mut self) {
+        while let Some(entry) = self.actions.first_entry()
+            && entry.key().0 <= self.machine.now()
+        {
+            entry.remove()(self);
+        }
+    }
+
+    /// All supplies off and on again, now: every chip and the MCU begin anew, the flash keeps its content.
+    pub fn power_cycle(&mut self) {
+        let now_s = self.now_s();
+        self.machine.board(|board| {
+            board.flash.advance(now_s);
+            board.flash.power_off(now_s);
+            board.meter.brown_out(now_s);
+            board.converter.reset(now_s);
+        });
+        self.machine.power_cycle();
+        self.machine.board(|board| board.flash.power_on(now_s));
     }
 
     /// Runs until `condition` holds, looked at every millisecond; how long it took.
@@ -280,7 +321,8 @@ impl<'firmware> Rig<'firmware> {
     }
 }
 
-fn with_crc(body: &[u8]) -> Vec<u8> {
+/// A Modbus frame: `body` and its CRC.
+pub fn with_crc(body: &[u8]) -> Vec<u8> {
     [body, &crc16(body)].concat()
 }
 

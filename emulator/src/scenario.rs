@@ -29,6 +29,9 @@ pub struct Row {
     pub converter_supply_v: f64,
     /// Current in a neighbouring conductor, in A.
     pub aux_current_a: f64,
+    /// Shift of every sensor's output against the board's ground, in V: what low-voltage loads do with the key in ACC (D4),
+    /// or a zero error that comes and goes.
+    pub output_shift_v: f64,
     /// Voltage of the limiting cell as the battery management sends it, in V; `None` if it sends none.
     pub cell_v: Option<f64>,
     /// Voltage of the pack, in V.
@@ -49,6 +52,7 @@ impl Row {
             sensor_supply_v: 5.0,
             converter_supply_v: 5.0,
             aux_current_a: 0.0,
+            output_shift_v: 0.0,
             cell_v: None,
             pack_v: None,
             cell_temperature_c: None,
@@ -79,6 +83,7 @@ impl Row {
             sensor_supply_v: mix(a.sensor_supply_v, b.sensor_supply_v),
             converter_supply_v: mix(a.converter_supply_v, b.converter_supply_v),
             aux_current_a: mix(a.aux_current_a, b.aux_current_a),
+            output_shift_v: mix(a.output_shift_v, b.output_shift_v),
             cell_v: mix_known(a.cell_v, b.cell_v),
             pack_v: mix_known(a.pack_v, b.pack_v),
             cell_temperature_c: mix_known(a.cell_temperature_c, b.cell_temperature_c),

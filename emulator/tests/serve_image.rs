@@ -12,6 +12,9 @@ use emulator::rig::{Firmware, Rig, Setup};
 use emulator::scenario::{Contactors, Key, Row, Scenario};
 use serve_support::{Running, project};
 
+/// Longer than docs/firmware.md gives the start: 450 ms for the storage, 100 ms for the test of the meter.
+const START_S: f64 = 1.0;
+
 /// A car that stands: key off, nobody else on the bus. At half the speed, so that a busy machine keeps up.
 fn standing() -> Running {
     Running::start_with(0.5, |session, stop| {
@@ -22,6 +25,8 @@ fn standing() -> Running {
             Setup::nominal(Scenario::new(rows, Contactors::Permitted)?),
         )?;
         rig.machine.board(|board| board.vehicle.silent = true);
+        // What is asked while the board starts is not answered, here as on a real one.
+        rig.run_s(START_S)?;
         rig.keep_frames = true;
         session.run(&mut rig, stop, &mut |notice| eprintln!("{notice}"))
     })

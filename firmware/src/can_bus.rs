@@ -27,6 +27,8 @@ const ABANDON_AFTER: Duration = Duration::from_ticks(20_000);
 
 /// TSR: give up all three mailboxes.
 const ABORT_ALL: u32 = 1 << 7 | 1 << 15 | 1 << 23;
+/// TSR: request completed, of all three mailboxes.
+const COMPLETED_ALL: u32 = 1 | 1 << 8 | 1 << 16;
 
 /// The peripheral as bxcan wants it; the register block stays reachable for what bxcan does not offer.
 pub struct Controller(CAN1);
@@ -49,8 +51,6 @@ unsafe impl bxcan::MasterInstance for Controller {}
 pub struct Counters {
     /// Frames that left the board.
     pub sent: u32,
-    /// Frames that were given up because the bus did not take them.
-    pub abandoned: u32,
     /// Frames received.
     pub received: u32,
     /// Times the receive buffer overran.
@@ -111,11 +111,30 @@ impl Bus {
         self.pump(now);
     }
 
+    /// Counts what has left the board, by how the request ended: a frame that is just on the bus when it is given up may
+    /// still be sent (RM0090, bxCAN, abort).
+    ///
+    /// Only the flags that were read are cleared: a frame may end in between.
+    fn count_sent(&mut self) {
+        let register = self.can.instance().0.tsr();
+        let status = register.read();
+        let sent = status.txok0().bit_is_set()
+            || status.txok1().bit_is_set()
+            || status.txok2().bit_is_set();
+        // SAFETY: clears the flags that are one; the other bits of this register ignore a zero.
+        register.write(|w| unsafe { w.bits(status.bits() & COMPLETED_ALL) });
+        if sent {
+            self.counters.sent = self.counters.sent.saturating_add(1);
+        }
+    }
+
     /// Hands the most urgent frame to the controller when it is idle.
     fn pump(&mut self, now: Instant) {
         if self.policy.is_off() || !self.can.is_transmitter_idle() {
             return;
         }
+        // Here and not in the interrupt: the next request clears the flags of the one before it.
+        self.count_sent();
         self.in_mailbox = None;
         let Some(frame) = self.queue.pop() else {
             return;
@@ -130,16 +149,7 @@ impl Bus {
 
     /// The transmit interrupt: a mailbox has become empty.
     pub fn on_transmitted(&mut self, now: Instant) {
-        let sent = {
-            let status = self.can.instance().0.tsr().read();
-            status.txok0().bit_is_set()
-                || status.txok1().bit_is_set()
-                || status.txok2().bit_is_set()
-        };
-        self.can.clear_tx_interrupt();
-        if sent {
-            self.counters.sent = self.counters.sent.saturating_add(1);
-        }
+        self.count_sent();
         self.pump(now);
     }
 
@@ -199,9 +209,7 @@ impl Bus {
         if off || waits_too_long {
             // SAFETY: abort requests; the other bits of this register ignore a zero.
             controller.tsr().write(|w| unsafe { w.bits(ABORT_ALL) });
-            if self.in_mailbox.take().is_some() {
-                self.counters.abandoned = self.counters.abandoned.saturating_add(1);
-            }
+            self.in_mailbox = None;
         }
         self.pump(now);
     }

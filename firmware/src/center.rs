@@ -83,6 +83,7 @@ pub struct Center {
     ticks: u32,
     page: u8,
     stated: u32,
+    seconds: u32,
     shown: Option<Code>,
     meter_report_at: Option<Instant>,
     seen: Seen,
@@ -129,6 +130,7 @@ impl Center {
             ticks: 0,
             page: 0,
             stated: 0,
+            seconds: 0,
             shown: None,
             meter_report_at: None,
             seen: Seen::default(),
@@ -215,8 +217,10 @@ impl Center {
         }
         self.log_due |= !tick.changes.cleared.is_empty();
         self.send(now);
+        if let Some(config) = self.measurement.changed_meter_config(&self.configuration) {
+            link.config = config;
+        }
         if self.ticks.is_multiple_of(10) {
-            link.config = self.measurement.meter_config(&self.configuration);
             let (slot, bytes) = self.slots.write(&self.measurement.retained(0));
             retain::set_slot(slot, &bytes);
         }
@@ -270,7 +274,8 @@ impl Center {
         }
         let bus = self.bus.counters();
         let rows = [
-            (Code::MeterNoAnswer, !health.counting),
+            // During the self-test the chip answers; it just counts nothing that anybody may use.
+            (Code::MeterNoAnswer, !health.counting && !link.in_self_test),
             (Code::MeterDeadBus, health.dead_bus),
             (Code::MeterChecksum, seen.checksum_bad),
             (Code::MeterReset, grown(&mut seen.resets, health.resets)),
@@ -368,8 +373,14 @@ impl Center {
         let due = self.ticks.wrapping_sub(self.stated) >= SECOND;
         if due {
             self.stated = self.ticks;
+            self.seconds = self.seconds.wrapping_add(1);
         }
         due
+    }
+
+    /// How often [`Center::second_passed`] was true.
+    pub const fn seconds(&self) -> u32 {
+        self.seconds
     }
 
     /// Fills in what is known here.

@@ -1,7 +1,7 @@
-//! The ADS1100's owner, at priority 2: one single conversion after the other.
+//! The ADS1100's owner, at priority 1: one single conversion after the other.
 //!
-//! The chip is asked when a conversion may have ended and then once a millisecond until its time-out. A transfer takes
-//! 0.1 ms; a bus that hangs costs 0.3 ms, a recovery of 0.1 ms and one sample.
+//! The chip is asked when the last conversion's time has passed and then once a millisecond until its time-out. A transfer takes
+//! 0.1 ms; a bus that hangs costs 1.5 ms, a recovery of 0.1 ms and one sample.
 
 use ads1100::{Address, Ads1100, Conversion, Error, Sample};
 use core_logic::{

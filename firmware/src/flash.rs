@@ -18,6 +18,8 @@ pub const CAPACITY: usize = 4 * 1024 * 1024;
 /// The smallest unit that can be erased.
 pub const SECTOR: usize = 4 * 1024;
 const PAGE: u32 = 256;
+/// Bytes read back at once.
+const COMPARED: usize = 32;
 
 const READ_IDENTITY: u8 = 0x9F;
 const READ_STATUS: u8 = 0x05;
@@ -52,6 +54,8 @@ pub enum Error<E> {
     OutOfBounds,
     /// Not a sector's beginning.
     NotAligned,
+    /// What was written does not read back: the chip is worn out there.
+    NotWritten,
 }
 
 impl<E: core::fmt::Debug> NorFlashError for Error<E> {
@@ -131,6 +135,22 @@ impl<SPI: SpiDevice> Flash<SPI> {
         Err(Error::Timeout)
     }
 
+    /// A worn cell takes a program without a word: only what reads back is written.
+    fn compare(&mut self, mut at: u32, written: &[u8]) -> Result<(), Error<SPI::Error>> {
+        for part in written.chunks(COMPARED) {
+            let mut buffer = [0; COMPARED];
+            let Some(read) = buffer.get_mut(..part.len()) else {
+                return Err(Error::OutOfBounds);
+            };
+            self.transfer(&command(READ, at), read)?;
+            if *read != *part {
+                return Err(Error::NotWritten);
+            }
+            at = at.saturating_add(u32::try_from(part.len()).unwrap_or(0));
+        }
+        Ok(())
+    }
+
     fn enable_write(&mut self) -> Result<(), Error<SPI::Error>> {
         self.0.write(&[WRITE_ENABLE]).map_err(Error::Bus)?;
         if self.status()? & STATUS_WRITE_ENABLED == 0 {
@@ -202,6 +222,7 @@ impl<SPI: SpiDevice> NorFlash for Flash<SPI> {
                 ])
                 .map_err(Error::Bus)?;
             self.wait(PROGRAM_LIMIT_MS).await?;
+            self.compare(at, now)?;
             at = at.saturating_add(u32::try_from(now.len()).unwrap_or(0));
             left = later;
         }

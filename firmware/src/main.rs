@@ -46,7 +46,7 @@ mod app {
     use core_logic::{
         check_in::{CheckIn, Task},
         configuration::{Configuration, ConfigurationStore},
-        converter::ConverterSample,
+        converter::{ConverterSample, PollPace},
         diagnosis::Code,
         front_end::Channel,
         measurement::{ConverterFault, Order},
@@ -93,6 +93,13 @@ mod app {
         ALIVE.fetch_or(1 << task as u32, Ordering::Relaxed);
     }
 
+    /// The next time at which the milliseconds since the start divided by [`TICK_MS`] leave `phase_ms`.
+    fn next_on_grid(phase_ms: u32) -> fugit::MonotonicTimerInstantU32<1_000> {
+        let now = Mono::now();
+        let into = now.duration_since_epoch().as_millis() % TICK_MS;
+        now + ((phase_ms + TICK_MS - into - 1) % TICK_MS + 1).millis()
+    }
+
     fn ask_meter(events: u32) {
         METER_EVENTS.fetch_or(events, Ordering::AcqRel);
         METER_WAKE.writer().write(());
@@ -104,11 +111,16 @@ mod app {
     /// Every task has to check in from here on, started or not.
     const START_LIMIT: Duration = Duration::from_ticks(1_000_000);
     const METER_POLL_MS: u32 = 20;
+    /// The meter's steps lie halfway between two ticks: its priority is the higher one, and setting the chip up takes
+    /// 0.6 ms, by which a frame would be late.
+    const METER_PHASE_MS: u32 = TICK_MS / 2;
     /// Ten seconds: a conversion adds a little noise to the energy.
     const TEMPERATURE_EVERY_POLLS: u32 = 500;
     /// The result is fetched this long before the next conversion, when even a slow one has ended.
     const TEMPERATURE_AFTER_POLLS: u32 = 400;
     const TICK_MS: u32 = 10;
+    /// Idle looks for late tasks at most this often.
+    const IDLE_LOOK_US: u32 = 10_000;
     /// Time between two log records when nothing happens.
     const LOG_PERIOD_MS: u32 = 10_000;
     /// Stack that has to stay free.
@@ -253,7 +265,14 @@ mod app {
         for task in [Task::Storage, Task::Rs485] {
             check_in.enable(task, start);
         }
+        let mut looked = time::micros();
         loop {
+            // Every interrupt ends the sleep, a thousand of them a second; who is late is late by more than this.
+            if time::micros().wrapping_sub(looked) < IDLE_LOOK_US {
+                cortex_m::asm::wfi();
+                continue;
+            }
+            looked = time::micros();
             let now = time::now();
             if !all && elapsed(start, now) >= START_LIMIT {
                 all = true;
@@ -316,18 +335,21 @@ mod app {
                 .channel()
                 .restore(charge, Nanocoulombs::ZERO, Nanocoulombs::ZERO);
         }
+        let mut next_poll = next_on_grid(METER_PHASE_MS);
         if meter.is_fresh() {
             cx.shared.meter_link.lock(|link| link.in_self_test = true);
+            Mono::delay_until(next_poll).await;
             if let Some(start) = meter.start_self_test() {
-                for _ in 0..meter::SELF_TEST_MS / 10 {
-                    Mono::delay(10.millis()).await;
+                for _ in 0..meter::SELF_TEST_MS / TICK_MS {
+                    next_poll += TICK_MS.millis();
+                    Mono::delay_until(next_poll).await;
                     alive(Task::Meter);
                 }
                 meter.finish_self_test(start);
             }
         }
         cx.shared.meter_link.lock(|link| link.in_self_test = false);
-        let mut next_poll = Mono::now();
+        Mono::delay_until(next_poll).await;
         let mut polls = 0_u32;
         let mut next_temperature = 0;
         let (mut edge, mut interrupt, mut verify, mut poll) = (false, false, true, true);
@@ -431,7 +453,7 @@ mod app {
                 (verify, poll) = (true, true);
                 next_poll += METER_POLL_MS.millis();
                 if Mono::now() >= next_poll {
-                    next_poll = Mono::now() + METER_POLL_MS.millis();
+                    next_poll = next_on_grid(METER_PHASE_MS);
                 }
             }
         }
@@ -453,9 +475,12 @@ mod app {
     }
 
     /// The converter's owner. Deadline one conversion, 31 ms: a miss costs a sample of the average; stale after three.
-    #[task(priority = 2, local = [converter], shared = [center, edges])]
+    ///
+    /// At the lowest priority, for it polls the bus for 0.1 ms at a time, and the CAN frames have no such time to spare.
+    #[task(priority = 1, local = [converter], shared = [center, edges])]
     async fn conversion(mut cx: conversion::Context) {
         let converter = cx.local.converter;
+        let mut pace = PollPace::default();
         loop {
             alive(Task::Conversion);
             let (channel, config) = cx.shared.center.lock(|center| {
@@ -470,7 +495,7 @@ mod app {
             }
             let started = time::now();
             let outcome = match converter.start(&config) {
-                Ok(()) => finish(converter, &config).await,
+                Ok(()) => finish(converter, &config, &mut pace).await,
                 Err(fault) => Err(fault),
             };
             let finished = time::now();
@@ -502,20 +527,27 @@ mod app {
         }
     }
 
-    /// Polls the conversion under way from 0.8 to 1.5 of its nominal time.
+    /// Polls the conversion under way from shortly before its end to 1.5 of its nominal time.
     async fn finish(
         converter: &mut Converter,
         config: &core_logic::converter::ConverterConfig,
+        pace: &mut PollPace,
     ) -> Result<Option<i16>, ConverterFault> {
-        let period_ms = u32::try_from(config.data_rate.period().as_millis()).unwrap_or(125);
-        Mono::delay((period_ms * 4 / 5).millis()).await;
-        for _ in 0..period_ms * 7 / 10 + 2 {
-            match converter.poll(config)? {
-                Progress::Busy => Mono::delay(1.millis()).await,
-                Progress::Discarded => return Ok(None),
-                Progress::Ready(sample) => return Ok(Some(sample.code)),
-            }
+        let first_ms = pace.first_ms(config.data_rate);
+        Mono::delay(first_ms.millis()).await;
+        for waited_ms in first_ms..=PollPace::limit_ms(config.data_rate) {
+            let code = match converter.poll(config)? {
+                Progress::Busy => {
+                    Mono::delay(1.millis()).await;
+                    continue;
+                }
+                Progress::Discarded => None,
+                Progress::Ready(sample) => Some(sample.code),
+            };
+            pace.ended(waited_ms);
+            return Ok(code);
         }
+        pace.unknown();
         converter.on_timeout();
         Err(ConverterFault::NoAnswer)
     }
@@ -523,21 +555,22 @@ mod app {
     /// Environment, diagnosis, permit and CAN, every 10 ms with at most 0.5 ms of jitter. A miss: a late frame.
     #[task(priority = 2, local = [analog, lines], shared = [center, edges, meter_link])]
     async fn tick(mut cx: tick::Context) {
-        let mut next = Mono::now();
+        let mut next = next_on_grid(0);
         loop {
-            next += TICK_MS.millis();
             Mono::delay_until(next).await;
+            next += TICK_MS.millis();
             alive(Task::Tick);
             time::extend();
             let now = time::now();
             let history = cx.shared.edges.lock(|edges| edges.history(now));
-            let readings = cx.local.analog.read();
+            let readings = cx.local.analog.begin_tick();
             let levels = cx.local.lines.levels();
             let mut link = cx.shared.meter_link.lock(|link| *link);
             let permit = cx
                 .shared
                 .center
                 .lock(|center| center.tick(now, &history, levels, &readings, &mut link));
+            cx.local.analog.end_tick();
             cx.shared.meter_link.lock(|shared| {
                 shared.bridge = link.bridge;
                 shared.config = link.config;
@@ -645,24 +678,32 @@ mod app {
             if corrupt {
                 checked = now;
             }
-            let (active, changed, damaged) = cx.shared.administration.lock(|administration| {
-                let store = &mut administration.store;
-                let damaged = corrupt && store.verify().is_err();
-                if let Some(found) = found
-                    && let Ok(active) = store.stage()
-                {
-                    let mut staged = *active;
-                    found.store(&mut staged);
-                    if store.commit(staged).is_err() {
-                        defmt::warn!("calibration not taken: {}", found);
+            let (active, crc, changed, mut damaged) =
+                cx.shared.administration.lock(|administration| {
+                    let store = &mut administration.store;
+                    let damaged = corrupt && store.verify().is_err();
+                    if let Some(found) = found
+                        && let Ok(active) = store.stage()
+                    {
+                        let mut staged = *active;
+                        found.store(&mut staged);
+                        if store.commit(staged).is_err() {
+                            defmt::warn!("calibration not taken: {}", found);
+                        }
                     }
-                }
-                let changed = store.generation() != generation;
-                generation = store.generation();
-                (*store.active(), changed, damaged)
-            });
+                    let changed = store.generation() != generation;
+                    generation = store.generation();
+                    (*store.active(), store.crc(), changed, damaged)
+                });
             if changed {
                 apply(&mut cx, &active);
+            } else if corrupt {
+                // What the measurement works with is a copy. Its CRC takes 0.5 ms, which the tick must not wait for.
+                let copy = cx.shared.center.lock(|center| center.configuration);
+                if copy.crc() != crc {
+                    apply(&mut cx, &active);
+                    damaged = true;
+                }
             }
             if damaged {
                 cx.shared.center.lock(|center| {
@@ -800,6 +841,8 @@ mod app {
             }
             *administration.store.active()
         });
+        // Without a record the next start could not even say that something was lost.
+        let mut first_save = !matches!(state, Stored::Value(_));
         let retained = retained_state(cx.local.previous, state);
         let (charge, meter_config) = cx.shared.center.lock(|center| {
             let (state, slots, loss) = &retained;
@@ -850,7 +893,10 @@ mod app {
                     center.configuration.save_policy,
                 )
             });
-            if policy.due(&save, now, state.charge_total) && storage.save_state(&state).await {
+            if (first_save || policy.due(&save, now, state.charge_total))
+                && storage.save_state(&state).await
+            {
+                first_save = false;
                 policy.saved(now, state.charge_total);
             }
             let due = cx
@@ -932,7 +978,7 @@ mod app {
         administration.lock(|administration| administration.busy = false);
     }
 
-    /// Once per turn of the storage task: its conditions; once a second the stack and the state.
+    /// Once per turn of the storage task: its conditions; once a second the state, and at times the stack.
     fn supervise(
         storage: &mut Storage,
         center: &mut impl rtic::Mutex<T = Center>,
@@ -957,12 +1003,21 @@ mod app {
         if !due {
             return;
         }
-        let used = stack::high_water_bytes();
-        let (current, charge) = center.lock(|center| {
-            let free = stack::BYTES.saturating_sub(used);
-            center.conditions.little_stack = free < STACK_RESERVE;
-            center.identity.stack_free = u32::try_from(free).unwrap_or(0);
-            (center.measurement.current(), center.measurement.charge())
+        // It reads up to 64 KiB, which takes a millisecond: every eighth second, the first one included.
+        let look = center.lock(|center| center.seconds() % 8 == 1);
+        let used = look.then(stack::high_water_bytes);
+        let (current, charge, used) = center.lock(|center| {
+            if let Some(used) = used {
+                let free = stack::BYTES.saturating_sub(used);
+                center.conditions.little_stack = free < STACK_RESERVE;
+                center.identity.stack_free = u32::try_from(free).unwrap_or(0);
+            }
+            let used = stack::BYTES.saturating_sub(center.identity.stack_free as usize);
+            (
+                center.measurement.current(),
+                center.measurement.charge(),
+                used,
+            )
         });
         defmt::info!(
             "{} {}, {} {}, stack {}",

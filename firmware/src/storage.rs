@@ -163,7 +163,7 @@ impl Storage {
     }
 
     async fn newest(&mut self, region: Range<u32>) -> Result<Option<&[u8]>, ()> {
-        let (Ok(config), true) = (QueueConfig::try_new(region), self.ready) else {
+        let (Ok(config), true) = (QueueConfig::try_new(region.clone()), self.ready) else {
             return Err(());
         };
         let mut queue = QueueStorage::new(&mut self.flash, config, Cache::new_uncached());
@@ -180,7 +180,27 @@ impl Storage {
                 *to = *from;
             }
         }
+        // Nothing intact in a region that is not blank: there was a record once, and it is damaged.
+        if length.is_none() && !self.is_blank(region).await {
+            count(&mut self.counters.refused);
+            self.failed = true;
+            return Err(());
+        }
         Ok(length.and_then(|length| self.record.get(..length)))
+    }
+
+    /// Whether none of the region's sectors has ever been written.
+    async fn is_blank(&mut self, region: Range<u32>) -> bool {
+        let sector = u32::try_from(flash::SECTOR).unwrap_or(u32::MAX);
+        let mut at = region.start;
+        while at < region.end {
+            let mut mark = [0; 4];
+            if self.flash.read(at, &mut mark).await.is_err() || mark != [0xFF; 4] {
+                return false;
+            }
+            at += sector;
+        }
+        true
     }
 
     /// Writes the configuration; whether it is in the flash.
@@ -211,6 +231,7 @@ impl Storage {
             QueueConfig::try_new(region),
             self.ready,
         ) else {
+            self.failed = true;
             return Err(());
         };
         let mut queue = QueueStorage::new(&mut self.flash, config, Cache::new_uncached());

@@ -296,6 +296,11 @@ impl Ade7753 {
         self.accumulator.exact()
     }
 
+    /// Puts AENERGY to `counts`, its lower 24 bits counting, as if so much had gone through before (F6).
+    pub const fn preset_energy(&mut self, counts: i32) {
+        self.accumulator.preset(counts);
+    }
+
     /// A register's value now, without side effects; `None` for an address without register.
     pub fn peek(&self, address: u8) -> Option<u32> {
         registers::at(address).map(|register| self.value(register.address) & register.mask())

@@ -9,6 +9,7 @@ use std::{
     collections::BTreeMap,
     env, fs,
     path::{Path, PathBuf},
+    process::Command,
 };
 
 use recording::{
@@ -222,5 +223,35 @@ fn a_table_packed_by_zstd_is_refused_by_its_name() {
     assert!(
         sentence.contains("column t_s: found values packed by ZSTD"),
         "{sentence}"
+    );
+}
+
+/// `HALLMARK_PYTHON` names a Python with `recording/python/requirements.txt`; `cargo xtask test` makes one and sets it.
+#[test]
+fn pyarrow_reads_our_parquet_as_python_reads_our_csv() {
+    let options = Options {
+        database: Some(Database::read(&folder().join("board.dbc")).unwrap()),
+        ..Options::default()
+    };
+    let converted = convert::read(&folder().join("board.log"), &options, &mut |_| {}).unwrap();
+    let out = tempfile::tempdir().unwrap();
+    let [parquet, csv] = ["out.parquet", "out.csv"].map(|name| out.path().join(name));
+    for path in [&parquet, &csv] {
+        convert::write(path, converted.columns(), &mut |_| {}).unwrap();
+    }
+    let python = env::var_os("HALLMARK_PYTHON").expect(
+        "HALLMARK_PYTHON has to name a Python with the packages of recording/python/requirements.txt; `cargo xtask test` sets it",
+    );
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/compare_parquet.py");
+    let output = Command::new(python)
+        .arg("-B")
+        .args([&script, &parquet, &csv])
+        .output()
+        .unwrap();
+    assert!(
+        output.status.success(),
+        "{}{}",
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr)
     );
 }

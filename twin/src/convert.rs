@@ -33,7 +33,7 @@ pub struct Arguments {
     /// The recording to write; its ending says the format: .csv or .parquet.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Calls a column, or a signal <Message>.<Signal>, by another name.
+    /// Calls a column, or a signal Message.Signal, by another name.
     #[arg(long, value_name = "NAME=COLUMN")]
     map: Vec<String>,
     /// The bus to take where a log has several: an interface such as can0, or a channel such as 1.

@@ -1,6 +1,6 @@
 //! Installing packages on Debian, never without saying so.
 
-use std::{fs, process::Command};
+use std::{fs, path::PathBuf, process::Command};
 
 use anyhow::{Context, Result, bail};
 
@@ -10,6 +10,16 @@ use crate::process;
 enum Way {
     Root,
     Sudo,
+}
+
+/// A program's path; installs the Debian package of the same name if it is missing.
+pub fn program(name: &str) -> Result<PathBuf> {
+    if let Some(path) = process::find_on_path(name) {
+        return Ok(path);
+    }
+    eprintln!("{name} is missing here");
+    install(&[name])?;
+    process::find_on_path(name).with_context(|| format!("{name} is installed and yet not on PATH"))
 }
 
 /// Installs the packages, or says which ones the user has to install.

@@ -29,6 +29,8 @@ pub fn target(toolchain: &Toolchain) -> Result<()> {
         "firmware",
         "--package",
         "instruction-count",
+        "--package",
+        "cpu-programs",
         "--",
         "--deny",
         "warnings",

@@ -1,13 +1,15 @@
-//! The project's commands: `cargo xtask demo`, `test`, `build`, `size`, `flash`, `doc`, `setup`.
+//! The project's commands: `cargo xtask demo`, `test`, `emulate`, `bench`, `build`, `size`, `flash`, `doc`, `setup`.
 //!
-//! Everything a command needs beyond a Rust compiler for the host (a compiler for the board, QEMU, Python's
-//! `cantools`) is found or installed by the command itself; docs/toolchain.md says how.
+//! Everything a command needs beyond a Rust compiler for the host (a compiler for the board, QEMU, ngspice, Python
+//! with its packages) is found or installed by the command itself; docs/toolchain.md says how.
 
 mod apt;
 mod dbc;
 mod demo;
 mod doc;
+mod emulate;
 mod flash;
+mod foreign_logs;
 mod image;
 mod instruction_count;
 mod lint;
@@ -45,7 +47,7 @@ const MISSING: u8 = 2;
     about = "The commands of the Hallmark board"
 )]
 #[command(
-    after_help = "Examples:\n  cargo xtask demo      a recorded drive through the measuring logic\n  cargo xtask test      set up what is missing, then run every check and test"
+    after_help = "Examples:\n  cargo xtask demo      a recorded drive through the measuring logic\n  cargo xtask test      set up what is missing, then run every check and test\n  cargo xtask emulate --profile recordings/panasonic-18650pf/25c-us06.csv --scale 19 --duration 600\n                        the same drive on the emulated board, which runs the firmware image"
 )]
 struct CommandLine {
     #[command(subcommand)]
@@ -60,6 +62,20 @@ enum Command {
     /// Set up what is missing, then run every check and every test
     #[command(after_help = "Example:\n  cargo xtask test")]
     Test,
+    /// Run the release image on the emulated board (`--help` tells the arguments)
+    #[command(disable_help_flag = true)]
+    Emulate {
+        /// As for `emulate drive`
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
+    /// Measure the firmware's and the emulator's figures of merit on the emulated board
+    #[command(disable_help_flag = true)]
+    Bench {
+        /// As for `emulate bench`
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
     /// Build the release image and print where its ELF file is
     #[command(after_help = "Example:\n  arm-none-eabi-objdump -d \"$(cargo xtask build)\"")]
     Build,
@@ -104,6 +120,8 @@ fn run(command: &Command) -> Result<ExitCode> {
         } else {
             ExitCode::from(FAILED)
         }),
+        Command::Emulate { arguments } => match emulate::run(&workspace, "drive", arguments)? {},
+        Command::Bench { arguments } => match emulate::run(&workspace, "bench", arguments)? {},
         Command::Build => {
             let toolchain = toolchain::choose(&workspace)?;
             println!("{}", image::build(&workspace, &toolchain)?.display());
@@ -135,7 +153,14 @@ fn run(command: &Command) -> Result<ExitCode> {
             let toolchain = toolchain::choose_again(&workspace)?;
             eprintln!("firmware compiler: {}", toolchain.describe());
             eprintln!("qemu: {}", qemu::find()?.display());
-            eprintln!("python: {}", python::environment(&workspace)?.display());
+            eprintln!(
+                "ngspice: {}",
+                apt::program(test_command::NGSPICE)?.display()
+            );
+            let python = python::environment(&workspace)?;
+            eprintln!("python: {}", python.display());
+            let logs = foreign_logs::make(&workspace, &python)?;
+            eprintln!("logs by other tools: {}", logs.display());
             Ok(ExitCode::SUCCESS)
         }
     }

@@ -11,13 +11,22 @@ use anyhow::{Context, Result};
 
 use crate::{apt, process, workspace::Workspace};
 
-/// The environment's interpreter; makes the environment if `can/check/requirements.txt` changed or it is not there.
+/// What is in the environment, one list for each user of it. A package that stands in two has the same version in both.
+const LISTS: [&str; 3] = [
+    "can/check/requirements.txt",
+    "emulator/clients/requirements.txt",
+    "recording/python/requirements.txt",
+];
+
+/// The environment's interpreter; makes the environment if one of [`LISTS`] changed or it is not there.
 pub fn environment(workspace: &Workspace) -> Result<PathBuf> {
-    let list = workspace.root.join("can/check/requirements.txt");
-    let requirements =
-        fs::read_to_string(&list).with_context(|| format!("reading {}", list.display()))?;
+    let lists = LISTS.map(|list| workspace.root.join(list));
     let mut hasher = DefaultHasher::new();
-    requirements.hash(&mut hasher);
+    for list in &lists {
+        fs::read_to_string(list)
+            .with_context(|| format!("reading {}", list.display()))?
+            .hash(&mut hasher);
+    }
     let folder = workspace
         .target_dir
         .join("python")
@@ -37,24 +46,24 @@ pub fn environment(workspace: &Workspace) -> Result<PathBuf> {
         fs::remove_dir_all(&folder).with_context(|| format!("removing {}", folder.display()))?;
     }
     process::run_to_stderr(Command::new("python3").args(["-m", "venv"]).arg(&folder))?;
-    process::run_to_stderr(&mut pip(&python, &list))?;
+    process::run_to_stderr(&mut pip(&python, &lists))?;
     fs::write(&complete, "")?;
     Ok(python)
 }
 
-fn pip(python: &Path, list: &Path) -> Command {
+fn pip(python: &Path, lists: &[PathBuf]) -> Command {
     let mut command = Command::new(python);
-    command
-        .args([
-            "-m",
-            "pip",
-            "install",
-            "--quiet",
-            "--disable-pip-version-check",
-            "--no-deps",
-            "--requirement",
-        ])
-        .arg(list);
+    command.args([
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--disable-pip-version-check",
+        "--no-deps",
+    ]);
+    for list in lists {
+        command.arg("--requirement").arg(list);
+    }
     command
 }
 
@@ -62,4 +71,30 @@ fn pip(python: &Path, list: &Path) -> Command {
 fn has_venv() -> bool {
     process::on_path("python3")
         && process::output(Command::new("python3").args(["-c", "import venv, ensurepip"])).is_ok()
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use std::collections::BTreeMap;
+
+    use super::*;
+
+    #[test]
+    fn a_package_has_one_version_in_all_lists() {
+        let mut versions = BTreeMap::new();
+        for list in LISTS {
+            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(list);
+            let text = fs::read_to_string(path).unwrap();
+            for line in text.lines().filter(|line| !line.starts_with('#')) {
+                let (name, version) = line.split_once("==").unwrap();
+                let known = versions
+                    .entry(name.to_lowercase())
+                    .or_insert_with(|| version.to_owned());
+                assert_eq!(known, version, "{name} in {list}");
+            }
+        }
+        assert!(versions.len() > 9);
+    }
 }

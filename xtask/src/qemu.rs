@@ -6,7 +6,7 @@ use std::{
     time::Duration,
 };
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 
 use crate::{apt, process};
 
@@ -16,13 +16,7 @@ const LIMIT: Duration = Duration::from_secs(120);
 
 /// QEMU's path; installs it if it is missing.
 pub fn find() -> Result<PathBuf> {
-    if let Some(path) = process::find_on_path(PROGRAM) {
-        return Ok(path);
-    }
-    eprintln!("{PROGRAM} is missing here");
-    apt::install(&["qemu-system-arm"])?;
-    process::find_on_path(PROGRAM)
-        .with_context(|| format!("{PROGRAM} is installed and yet not on PATH"))
+    apt::program(PROGRAM)
 }
 
 /// Runs an ELF file on the AN386 board (a Cortex-M4 with flash at 0) and returns what it printed by semihosting. Every

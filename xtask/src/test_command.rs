@@ -3,11 +3,14 @@
 use anyhow::{Result, bail};
 
 use crate::{
-    dbc, doc, image, instruction_count, lint, report,
+    apt, dbc, doc, foreign_logs, image, instruction_count, lint, python, qemu, report,
     steps::Steps,
     tests_on_host, toolchain,
     workspace::{self, Workspace},
 };
+
+/// The circuit simulator, and Debian's package of it.
+pub const NGSPICE: &str = "ngspice";
 
 /// Runs every check, then every test; `true` if all is well. A check that fails does not keep the next from running.
 pub fn run(workspace: &Workspace) -> Result<bool> {
@@ -21,21 +24,41 @@ pub fn run(workspace: &Workspace) -> Result<bool> {
         println!("   {}", toolchain.describe());
         Ok(toolchain)
     });
+    steps.step("set-up: QEMU and ngspice", || {
+        println!("   {}", qemu::find()?.display());
+        println!("   {}", apt::program(NGSPICE)?.display());
+        Ok(())
+    });
+    let python = steps.step("set-up: Python", || python::environment(workspace));
+    let logs = match &python {
+        Some(python) => steps.step("set-up: logs by other tools", || {
+            foreign_logs::make(workspace, python)
+        }),
+        None => {
+            steps.skip("set-up: logs by other tools", "there is no Python");
+            None
+        }
+    };
     steps.step("format", || lint::format(workspace));
     steps.step("clippy, host", || lint::host(workspace));
+    let (mut elf, mut programs) = (None, None);
     match &toolchain {
         Some(toolchain) => {
             steps.step("clippy, board", || lint::target(toolchain));
-            match steps.step("release image", || image::build(workspace, toolchain)) {
+            elf = steps.step("release image", || image::build(workspace, toolchain));
+            match &elf {
                 Some(elf) => {
                     println!("   {}", elf.display());
-                    steps.step("size", || report::memory(&elf, false));
+                    steps.step("size", || report::memory(elf, false));
                 }
                 None => steps.skip("size", "there is no image"),
             }
+            programs = steps.step("programs for the emulated CPU", || {
+                image::build_package(toolchain, "cpu-programs")
+            });
         }
         None => steps.skip(
-            "clippy for the board, release image, size",
+            "clippy for the board, release image, size, programs for the emulated CPU",
             "there is no compiler for the board",
         ),
     }
@@ -47,9 +70,15 @@ pub fn run(workspace: &Workspace) -> Result<bool> {
         None => steps.skip("instruction counts", "there is no compiler for the board"),
     }
     steps.step("documentation", || doc::build(workspace));
+    let provided = vec![
+        ("HALLMARK_IMAGE", elf),
+        ("HALLMARK_CPU_PROGRAMS", programs),
+        ("HALLMARK_PYTHON", python),
+        ("HALLMARK_FOREIGN_LOGS", logs),
+    ];
     let mut summary = None;
     steps.step("tests", || {
-        let (read, success) = tests_on_host::run(workspace)?;
+        let (read, success) = tests_on_host::run(workspace, &provided)?;
         summary = Some(read);
         if !success {
             bail!("`cargo test` failed");

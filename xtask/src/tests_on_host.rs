@@ -1,6 +1,6 @@
 //! Every test of the host crates, by cargo's own runner, and its summary.
 
-use std::fmt;
+use std::{fmt, path::PathBuf};
 
 use anyhow::{Context, Result, bail};
 
@@ -15,11 +15,21 @@ pub struct Summary {
     ignored: u64,
 }
 
+/// What tests use and cannot make themselves: the variable that names it to them, and where it is.
+pub type Provided = Vec<(&'static str, Option<PathBuf>)>;
+
 /// Unit, integration and documentation tests with every feature. The summary says what failed; the second value is
 /// whether the run as a whole succeeded, which a test that does not compile spoils without a summary line.
-pub fn run(workspace: &Workspace) -> Result<(Summary, bool)> {
+pub fn run(workspace: &Workspace, provided: &Provided) -> Result<(Summary, bool)> {
     let mut cargo = workspace.cargo();
     cargo.args(["test", "--no-fail-fast", "--all-features"]);
+    for (variable, path) in provided {
+        match path {
+            Some(path) => cargo.env(variable, path),
+            // An older one would hide that this one is not there.
+            None => cargo.env(variable, "not-there-because-its-set-up-failed"),
+        };
+    }
     let finished = process::tee(&mut cargo)?;
     Ok((Summary::read(&finished.stdout)?, finished.success))
 }

@@ -137,7 +137,7 @@ readings! {
 
     /// State of charge.
     soc: Ppm,
-    /// Its uncertainty, one sigma.
+    /// Its uncertainty, a half-width: the true value lies within plus or minus this.
     soc_uncertainty: Ppm,
     /// Why it is not valid.
     soc_validity: Validity,
@@ -315,7 +315,7 @@ inputs! {
 
     // State of charge.
     0x0080 I32 1 "state of charge" "ppm" "1,000,000 is full" |r, _| r.soc.get().into();
-    0x0082 I32 1 "uncertainty" "ppm" "of the state of charge, one sigma" |r, _| r.soc_uncertainty.get().into();
+    0x0082 I32 1 "uncertainty" "ppm" "half-width of the state of charge: the true value lies within plus or minus this" |r, _| r.soc_uncertainty.get().into();
     0x0084 U16 1 "state of charge validity" "bits" "causes; 0 is valid" |r, _| validity(r.soc_validity);
     0x0085 U16 1 "cell voltage validity" "bits" "causes; 0 is valid" |r, _| validity(r.cell_validity);
     0x0086 I64 1 "remaining charge" "mC" "left in the battery" |r, _| mc(r.remaining_charge);

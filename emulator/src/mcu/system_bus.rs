@@ -494,6 +494,14 @@ impl SystemBus {
         work(&mut self.lock().adc1)
     }
 
+    /// Works on TIM2, for a clock that is about to wrap.
+    pub fn with_timer<T>(&self, work: impl FnOnce(&mut Tim2) -> T) -> T {
+        let mut state = self.lock();
+        let result = work(&mut state.tim2);
+        self.publish(&state);
+        result
+    }
+
     /// Pins on which the MCU and the outside have driven against each other since the last call, as bits of each port.
     pub fn take_conflicts(&self) -> [u16; PORTS] {
         self.lock().gpio.take_conflicts()

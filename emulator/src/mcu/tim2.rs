@@ -62,6 +62,11 @@ impl Tim2 {
         }
     }
 
+    /// Puts the counter to `count`, as if so much time had passed (F23).
+    pub const fn preset(&mut self, count: u32) {
+        self.count = count;
+    }
+
     /// RM0090, `TIMx_ARR`: "The counter is blocked while the auto-reload value is null."
     const fn runs(&self) -> bool {
         self.cr1 & CR1_CEN != 0 && self.arr_active != 0

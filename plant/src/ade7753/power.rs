@@ -217,6 +217,12 @@ impl Accumulator {
         (self.whole as f64 + self.fraction) / (1i64 << HIDDEN_BITS) as f64
     }
 
+    /// Stands at `counts` of the visible bits, sign-extended from 24, and 0 below.
+    pub const fn preset(&mut self, counts: i32) {
+        self.whole = (counts as i64) << 40 >> 40 << HIDDEN_BITS;
+        self.fraction = 0.0;
+    }
+
     pub fn clear(&mut self, hidden_too: bool) {
         if hidden_too {
             *self = Self::default();

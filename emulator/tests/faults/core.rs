@@ -1,0 +1,157 @@
+//! F22 and F24: RAM and program.
+
+use core_logic::range::Range;
+use emulator::faults::configurations_in_ram;
+use emulator::mcu::rcc::ResetCause;
+use emulator::rig::Setup;
+use emulator::scenario::{Contactors, Scenario};
+
+use crate::bench::*;
+
+#[test]
+fn fault_f22_a_flipped_bit_of_the_configuration_is_found_and_defaults_take_over() {
+    let copies = configurations_in_ram(&steady(20.0));
+    println!("F22: {} copies of the configuration in RAM", copies.len());
+    assert!(!copies.is_empty());
+    let mut found = 0;
+    for (number, address) in copies.iter().enumerate() {
+        let mut rig = steady(20.0);
+        rig.run_s(0.3).unwrap();
+        let original = rig.machine.ram_word(*address).unwrap();
+        strike(&mut rig, &format!("F22:{number}"));
+        assert_ne!(rig.machine.ram_word(*address).unwrap(), original);
+        let mut named_s = None;
+        let start_s = rig.now_s();
+        watch(&mut rig, 1.4, |rig| {
+            if named_s.is_none() && was_raised(rig, "ConfigurationCorruptRam") {
+                named_s = Some(rig.now_s() - start_s);
+            }
+        });
+        let mended = rig.machine.ram_word(*address).unwrap() == original;
+        println!(
+            "F22 copy {number} at {address:#010X}: ConfigurationCorruptRam on CAN after {named_s:?} s, right again {mended}, \
+             current {:?}",
+            rig.view.current_a()
+        );
+        // Once a second, and the frame. A copy that nobody uses any more may stay as it is.
+        assert!(named_s.is_none_or(|named_s| named_s <= 1.2));
+        if named_s.is_some() {
+            found += 1;
+            assert!(mended);
+        }
+    }
+    // The guarded one and the one that is measured with.
+    assert!(found >= 2, "{found} of {} copies are watched", copies.len());
+}
+
+#[test]
+fn fault_f23_the_wrap_of_the_microsecond_counter_is_not_seen() {
+    // The middle of its range, where a word beside it takes over, and its end. The counter is put there at rest: a jump of
+    // half an hour is a disturbance of its own.
+    for jumps in [&[1_u64 << 31][..], &[1 << 31, 1 << 32]] {
+        let start_s = 5.0;
+        let rows = vec![
+            row(0.0),
+            row(start_s),
+            row(start_s + 0.01).with_current(50.0),
+            row(start_s + 2.0).with_current(50.0),
+            row(start_s + 2.01),
+        ];
+        let mut rig = rig_of(Setup::nominal(
+            Scenario::new(rows, Contactors::AlwaysClosed).unwrap(),
+        ));
+        rig.run_s(SETTLED_S).unwrap();
+        if jumps.len() > 1 {
+            rig.machine
+                .timer(|timer| timer.preset((jumps[0] - 100_000) as u32));
+            rig.run_s(0.5).unwrap();
+        }
+        let wrap = jumps[jumps.len() - 1];
+        let wraps_in_s = start_s + 1.0 - rig.now_s();
+        let before_us = (wraps_in_s * 1e6) as u64;
+        rig.machine
+            .timer(|timer| timer.preset((wrap - before_us) as u32));
+        rig.run_s(start_s - 0.1 - rig.now_s()).unwrap();
+        rig.view.diagnoses.clear();
+        rig.view.restart_periods();
+        let known = unexpected(&rig, &[]);
+        let before = charges_c(&mut rig);
+        rig.run_s(start_s + 2.4 - rig.now_s()).unwrap();
+        let error_c = charge_error_c(&mut rig, before);
+        let period = rig.view.period("Current");
+        let uptime = counters(&mut rig, 0x000E, 1)[0];
+        println!(
+            "F23 {wrap} µs: charge error {:.1} mC of 100 C, frames {:.2} … {:.2} ms apart, uptime {uptime} s, {:?}",
+            error_c * 1e3,
+            period.shortest_s * 1e3,
+            period.longest_s * 1e3,
+            unexpected(&rig, &known)
+        );
+        assert!(error_c.abs() <= quantum_c(Range::Small), "{error_c}");
+        assert!(period.longest_s <= 0.0125 && period.shortest_s >= 0.0075);
+        assert_eq!(unexpected(&rig, &known), Vec::<&str>::new());
+        // It went on: 1.4 s and the request after the wrap.
+        assert_eq!(u64::from(uptime), (wrap + 1_420_000) / 1_000_000);
+        assert_eq!(resets(&rig), 0);
+    }
+}
+
+#[test]
+fn fault_f24_the_board_is_back_after_a_hang_or_fault_with_its_charge_and_the_cause() {
+    let mut beyond = Vec::new();
+    for (fault, cause, diagnosis) in [
+        ("hang", ResetCause::IndependentWatchdog, "WatchdogReset"),
+        ("deadlock", ResetCause::IndependentWatchdog, "WatchdogReset"),
+        ("fault", ResetCause::Software, "PanicReset"),
+        ("stack", ResetCause::Software, "PanicReset"),
+    ] {
+        let mut rig = pulse(50.0, 6.0);
+        let before = charges_c(&mut rig);
+        rig.run_s(1.0).unwrap();
+        let struck_s = rig.now_s();
+        strike(&mut rig, &format!("F24:{fault}"));
+        until(&mut rig, "a reset", 2.0, |rig| resets(rig) > 0);
+        let reset = rig.machine.resets()[1];
+        let reset_s = reset.at.seconds();
+        let back_s = until(&mut rig, "a valid current", 1.0, |rig| {
+            let newest = rig.view.last_at("Current").unwrap();
+            newest > reset.at && rig.view.current_a().valid().is_some()
+        });
+        let named_s = until(&mut rig, "the cause on CAN", 2.0, |rig| {
+            let page = rig.view.signal("Identity", "IdentityPage") == Some(0.0);
+            rig.view.last_at("Identity").unwrap() > reset.at && page && is_latched(rig, diagnosis)
+        }) + back_s;
+        let said = rig.view.signal("Identity", "ResetCause");
+        rig.run_s(5.0).unwrap();
+        let error_c = charge_error_c(&mut rig, before);
+        let declared_c = rig
+            .view
+            .signal("MeterCurrent", "ChargeUncertainty")
+            .unwrap();
+        println!(
+            "F24 {fault}: reset by {:?} after {:.0} ms, valid current {:.0} ms later, cause {said:?} on CAN after {:.0} ms; \
+             charge {:+.2} C, declared {declared_c:.1} C",
+            reset.cause,
+            (reset_s - struck_s) * 1e3,
+            back_s * 1e3,
+            named_s * 1e3,
+            error_c
+        );
+        assert_eq!(reset.cause, cause, "{fault}");
+        // 0.68 … 1.88 s by the tolerance of LSI; 1 s at its typical frequency.
+        assert!(reset_s - struck_s <= 1.02, "{fault}");
+        assert!(back_s <= 0.35, "{fault}: {back_s}");
+        assert!(named_s <= 2.0, "{fault}: {named_s}");
+        assert_eq!(resets(&rig), 1, "{fault}");
+        if error_c.abs() > declared_c {
+            beyond.push((fault, error_c, declared_c));
+        }
+        // What flowed from the last word before the fault to the first reading after it, the meter's own count excepted.
+        let down_s = reset_s - struck_s + back_s + 0.15;
+        assert!(
+            error_c.abs() <= 50.0 * down_s + quantum_c(Range::Small),
+            "{fault}: {error_c}"
+        );
+    }
+    assert!(beyond.is_empty(), "beyond what is declared: {beyond:?}");
+}

@@ -1,0 +1,122 @@
+//! F9 and F10: the comparators and the range flag.
+
+use core_logic::error_budget::{hand_over_hidden, hand_over_latency};
+use core_logic::range::Range;
+use emulator::bus_view::validity;
+
+use crate::bench::*;
+
+/// Changes of the range as the board has counted them, and pairs of them that it knows it has not seen one by one.
+fn edges(rig: &mut emulator::rig::Rig<'_>) -> (u32, u32) {
+    let both = counters(rig, 0x004E, 2);
+    (both[0], both[1])
+}
+
+#[test]
+fn fault_f09_chatter_loses_no_edge_and_stays_within_the_declared_charge() {
+    // What one change may cost behind ideal sensors.
+    let per_edge_c = (hand_over_hidden() + hand_over_latency()) as f64 * 1e-9;
+    // Chatter is at home at the threshold; the slow ones also where nobody would expect them.
+    for (pattern, current_a) in [
+        ("10Hz,50%", 53.3),
+        ("10Hz,20%", 20.0),
+        ("100Hz,10%", 53.3),
+        ("100Hz,90%", -53.3),
+        ("300Hz,30%", 30.0),
+        ("1kHz,50%", 53.3),
+        ("10kHz,30%", -53.3),
+        ("100kHz,50%", 53.3),
+        ("100kHz,10%", 53.3),
+    ] {
+        let mut rig = pulse(current_a, 2.2);
+        let before = charges_c(&mut rig);
+        rig.run_s(0.4).unwrap();
+        rig.machine.restart_load();
+        rig.view.restart_periods();
+        strike(&mut rig, &format!("F9:{pattern},1500ms"));
+        rig.run_s(1.5).unwrap();
+        let load = rig.machine.load().share();
+        let longest_s = rig.view.period("Current").longest_s;
+        rig.run_s(1.2).unwrap();
+        let error_c = charge_error_c(&mut rig, before);
+        let truth = rig.truth();
+        let (counted, coalesced) = edges(&mut rig);
+        let (storm, chatter) = (
+            was_raised(&rig, "EdgeStorm"),
+            was_raised(&rig, "RangeChatter"),
+        );
+        let declared_c = rig.view.signal("MeterCurrent", "ChargeUncertainty");
+        println!(
+            "F9 {pattern} at {current_a} A: {} edges, counted {counted} and {coalesced} pairs, storm {storm}, chatter \
+             {chatter}; error {:+.1} mC, declared {declared_c:?} C, {:.3} mC per edge; load {:.1} %, frames at most {:.2} \
+             ms apart",
+            truth.edges,
+            error_c * 1e3,
+            error_c * 1e3 / truth.edges as f64,
+            load * 100.0,
+            longest_s * 1e3
+        );
+        if storm {
+            assert!(chatter);
+        } else {
+            assert_eq!(u64::from(counted) + 2 * u64::from(coalesced), truth.edges);
+        }
+        // Chatter is booked at the switching current, where comparators do it. Elsewhere it is a broken comparator, and the
+        // charge is off by what lies between.
+        let away_a = if current_a.abs() < 52.0 {
+            54.4 - current_a.abs()
+        } else {
+            0.0
+        };
+        let declared_c = declared_c.unwrap() + away_a * 1.6;
+        assert!(
+            error_c.abs() <= declared_c + quantum_c(Range::Large),
+            "{pattern}: {error_c}"
+        );
+        if truth.edges < 200 {
+            let bound_c = truth.edges as f64 * per_edge_c + quantum_c(Range::Large);
+            assert!(
+                error_c.abs() <= bound_c,
+                "{pattern}: {error_c} beyond {bound_c}"
+            );
+        }
+        assert!(load < 0.5, "{pattern}: {load}");
+        assert!(longest_s < 0.0125, "{pattern}: {longest_s}");
+        assert_eq!(resets(&rig), 0);
+        let expected = ["EdgeStorm", "RangeChatter", "FlagImplausible"];
+        assert_eq!(unexpected(&rig, &expected), Vec::<&str>::new(), "{pattern}");
+    }
+}
+
+#[test]
+fn fault_f10_a_flag_against_the_level_is_found_and_the_charge_is_doubted() {
+    for (stuck, current_a) in [("high", 30.0), ("low", 100.0), ("low", -250.0)] {
+        let mut rig = steady(current_a);
+        rig.run_s(0.5).unwrap();
+        strike(&mut rig, &format!("F10:{stuck},1s"));
+        let doubted_s = until(&mut rig, "a doubted current", 0.5, |rig| {
+            rig.view.current_a().validity & validity::IMPLAUSIBLE != 0
+        });
+        let named_s = doubted_s + until_diagnosis(&mut rig, "FlagImplausible", 0.2);
+        let mut unmarked = 0;
+        watch(&mut rig, 0.6, |rig| {
+            let value = rig.view.current_a().valid();
+            unmarked += usize::from(value.is_some_and(|value_a| (value_a - current_a).abs() > 1.0));
+        });
+        let charge = rig.view.charge_c();
+        rig.run_s(2.5).unwrap();
+        println!(
+            "F10 {stuck} at {current_a} A: current doubted after {:.0} ms, FlagImplausible on CAN after {:.0} ms, charge \
+             meanwhile {charge:?}",
+            doubted_s * 1e3,
+            named_s * 1e3
+        );
+        // 200 ms, and the frame that says so.
+        assert!(doubted_s <= 0.21, "{doubted_s}");
+        assert!(named_s <= 0.3, "{named_s}");
+        assert_eq!(unmarked, 0, "wrong currents marked valid");
+        assert!(charge.validity & validity::IMPLAUSIBLE != 0, "{charge:?}");
+        let back = rig.view.current_a();
+        assert!((back.valid().unwrap() - current_a).abs() < 0.5, "{back:?}");
+    }
+}
