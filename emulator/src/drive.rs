@@ -166,6 +166,8 @@ const SAMPLE: Ticks = Ticks::from_millis(1);
 const SETTLED_S: f64 = 1.0;
 /// What a new board says although nothing is wrong: before the battery has rested it knows no state of charge.
 const EXPECTED: &str = "SocUncertain";
+/// Rows stand at what bends the current by more than this between two samples of the truth, in A.
+const BEND_A: f64 = 0.01;
 /// Lines of the image's log that are kept for a message.
 const LAST_WORDS: usize = 10;
 
@@ -475,6 +477,9 @@ struct Sink {
     recording: Writer,
     /// The board as its frames tell of it, one after the other: the rig's own view is ahead.
     view: BusView,
+    /// Frames for whose end the truth is not known yet.
+    frames: VecDeque<LoggedFrame>,
+    /// The one before the newest row and all after it.
     samples: VecDeque<TruthSample>,
     /// Since the last row of the recording.
     news: News,
@@ -520,6 +525,7 @@ impl Sink {
             defmt_log: open(&files.defmt_log)?,
             recording: Writer::create(&files.recording, &COLUMNS)?,
             view: BusView::default(),
+            frames: VecDeque::new(),
             samples: VecDeque::new(),
             news: News::default(),
             folder,
@@ -549,67 +555,111 @@ impl Sink {
             )
             .context("writing can.log")?;
             if logged.from_board {
-                self.view.take(logged.at, &logged.frame);
-                self.tell(logged)?;
+                self.frames.push_back(*logged);
             }
+        }
+        while let Some(logged) = self.frames.front().copied() {
+            // Nearly all of the time the newest sample is from the end of this slice.
+            if !self.truth_until(logged.at.seconds())? {
+                break;
+            }
+            self.frames.pop_front();
+            self.view.take(logged.at, &logged.frame);
+            self.tell(&logged)?;
         }
         Ok(())
     }
 
-    /// Each current frame makes a row. What is slower is in the first row after it came, and in between its field is empty:
-    /// nobody shall take a held value for a measured one.
+    /// Brings the two samples around `at_s` to the front, with a row for each bend of the current on the way; `false` if the
+    /// second one has not come yet.
+    ///
+    /// Without these rows a straight line from row to row would cut the corners of the truth.
+    fn truth_until(&mut self, at_s: f64) -> Result<bool> {
+        loop {
+            let Some(next) = self.samples.get(1).copied() else {
+                return Ok(false);
+            };
+            if next.t_s > at_s {
+                return Ok(true);
+            }
+            let Some(after) = self.samples.get(2) else {
+                return Ok(false);
+            };
+            let bend_a = after.current_a - 2.0 * next.current_a + self.samples[0].current_a;
+            self.samples.pop_front();
+            if bend_a.abs() > BEND_A && next.t_s < at_s {
+                self.row(next.t_s, &News::default(), false)?;
+            }
+        }
+    }
+
+    /// Each current frame and each charge frame makes a row. What is slower is in the first row after it came, and in between
+    /// its field is empty: nobody shall take a held value for a measured one.
     fn tell(&mut self, logged: &LoggedFrame) -> Result<()> {
         let is = |header: &layout::Header| logged.frame.id == u32::from(header.id);
-        if is(&layout::charge::HEADER) {
-            self.news.charge = true;
-        } else if is(&layout::environment::HEADER) {
+        let charge = is(&layout::charge::HEADER);
+        if is(&layout::environment::HEADER) {
             self.news.environment = true;
         } else if is(&layout::state_of_charge::HEADER) {
             self.news.soc = true;
         }
+        let at_s = logged.at.seconds();
+        if charge {
+            let news = News {
+                charge,
+                ..News::default()
+            };
+            return self.row(at_s, &news, false);
+        }
         if !is(&layout::current::HEADER) {
             return Ok(());
         }
-        let at_s = logged.at.seconds();
-        // As in can.log, so that the two can be laid side by side.
-        let stamp_s = (at_s * 1e6).round() / 1e6;
-        while self.samples.get(1).is_some_and(|next| next.t_s <= at_s) {
-            self.samples.pop_front();
-        }
-        let Some(sample) = self.samples.front() else {
-            return Ok(());
-        };
-        let view = &self.view;
-        let conversions = view.signal("Current", "CurrentConversions");
+        let conversions = self.view.signal("Current", "CurrentConversions");
         let news = News {
             conversions,
             ..News::default()
         };
         let before = std::mem::replace(&mut self.news, news);
-        let News {
-            charge,
-            environment,
-            soc,
-            ..
-        } = before;
         let converted = conversions != before.conversions;
+        self.row(at_s, &before, converted)
+    }
+
+    /// A row of the recording, with what is new in it.
+    fn row(&mut self, at_s: f64, news: &News, converted: bool) -> Result<()> {
+        let Some(sample) = self.samples.front() else {
+            return Ok(());
+        };
+        let next = self.samples.get(1).unwrap_or(sample);
+        let length_s = next.t_s - sample.t_s;
+        let share = if length_s > 0.0 {
+            ((at_s - sample.t_s) / length_s).clamp(0.0, 1.0)
+        } else {
+            0.0
+        };
+        let between = |from: f64, to: f64| from + (to - from) * share;
+        // As in can.log, so that the two can be laid side by side.
+        let stamp_s = (at_s * 1e6).round() / 1e6;
+        let view = &self.view;
         let new = |is_new: bool, value: Option<f64>| value.filter(|_| is_new).unwrap_or(f64::NAN);
         self.recording.row(&[
             stamp_s,
-            sample.current_a,
+            between(sample.current_a, next.current_a),
             new(converted, view.current_a().valid()),
-            sample.charge_c,
-            new(charge, view.charge_c().value),
+            between(sample.charge_c, next.charge_c),
+            new(news.charge, view.charge_c().value),
             new(true, view.signal("Current", "CurrentRange")),
             new(
-                environment,
+                news.environment,
                 view.signal("Environment", "SensorSupply")
                     .map(|mv| mv / 1e3),
             ),
-            new(environment, view.signal("Environment", "SensorTemperature")),
+            new(
+                news.environment,
+                view.signal("Environment", "SensorTemperature"),
+            ),
             sample.row.aux_current_a,
             new(true, sample.row.cell_v),
-            new(soc, view.soc_pct().valid()),
+            new(news.soc, view.soc_pct().valid()),
         ])?;
         Ok(())
     }

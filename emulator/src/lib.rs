@@ -18,6 +18,7 @@ pub mod rig;
 pub mod rs485_line;
 pub mod rtt;
 pub mod scenario;
+pub mod sensors;
 pub mod serve;
 pub mod time;
 pub mod vehicle;

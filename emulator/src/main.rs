@@ -18,6 +18,7 @@ use emulator::faults;
 use emulator::profile::{self, Profile, ProfileOptions};
 use emulator::rig::{self, Firmware, Setup};
 use emulator::scenario::{Contactors, Key, Row, Scenario};
+use emulator::sensors;
 use emulator::serve;
 use emulator::time::Ticks;
 
@@ -49,6 +50,7 @@ const DRIVE_EXAMPLES: &str = "\
 Examples:
   cargo xtask emulate --profile recordings/panasonic-18650pf/25c-us06.csv --scale 19 --duration 600
   cargo xtask emulate --profile drive.csv --map i_ref_a=Shunt --map v_cell_v=Ucell --check
+  cargo xtask emulate --profile drive.csv --sensor large.gain=1.02 --sensor both.tc_a_per_k=0.02
   cargo xtask emulate --profile drive.csv --fault F9 --fault F21@7.5 --fault F14:open,large@10
   cargo xtask emulate --serve                    a parked car for python-can and a Modbus client
   cargo xtask emulate --serve --profile drive.csv --scale 19
@@ -92,6 +94,10 @@ struct DriveArguments {
     /// Puts a fault into the board, such as F9, F9:10kHz,30% or F9@2.5 (in s after power-on, else 2); may be given repeatedly
     #[arg(long, value_name = "FAULT")]
     fault: Vec<String>,
+    /// Changes a sensor, and the firmware does not know: large.gain=1.01, both.offset_a=-0.5, small.core.remanence_a=0.4; may be
+    /// given repeatedly
+    #[arg(long, value_name = "SENSOR.PARAMETER=VALUE")]
+    sensor: Vec<String>,
     /// Lists the faults with their parameters, and ends
     #[arg(long)]
     list_faults: bool,
@@ -304,6 +310,10 @@ fn setup(arguments: &DriveArguments, profile: Option<Profile>) -> Result<Setup, 
     };
     let mut setup = Setup::nominal(scenario);
     setup.board.step = Ticks::from_micros(arguments.step);
+    for text in &arguments.sensor {
+        sensors::change(&mut setup.board.front_end.sensors, text)
+            .map_err(|error| Failure::Input(error.to_string()))?;
+    }
     // Different numbers, so that no two sources of noise are the same.
     let seed = |number: u64| arguments.seed.wrapping_mul(16).wrapping_add(number);
     setup.converter.seed = seed(0);
@@ -329,6 +339,7 @@ fn report(arguments: &DriveArguments, figures: &Figures) -> serde_json::Result<S
             "step_us": arguments.step,
             "seed": arguments.seed,
             "faults": arguments.fault,
+            "sensor": arguments.sensor,
             "served": arguments.serve,
         },
         "figures": figures,

@@ -192,10 +192,24 @@ pub trait Effect: Sync {
     /// Changes the scene.
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>);
 
+    /// What the readings show by themselves, whatever the simulation says.
+    fn mark(&self, _scale: &Scale, _clues: &Clues<'_>) -> Option<Mark> {
+        None
+    }
+
     /// What follows from the values, in plain words.
     fn consequences(&self, _values: &[f64], _problem: &Problem) -> Vec<String> {
         Vec::new()
     }
+}
+
+/// An effect that shows without a simulation.
+#[derive(Clone, Debug)]
+pub struct Mark {
+    /// A value for each of its parameters.
+    pub values: Vec<f64>,
+    /// Variance that it adds to the residual, in the view's unit squared.
+    pub variance: f64,
 }
 
 /// What is known when starts are looked for: the readings that count, with the simulation so far.

@@ -16,7 +16,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use crate::effects::chain::{Chain, Nuisance};
-use crate::effects::{Effect, find, find_with};
+use crate::effects::{Effect, Search, find, find_with};
 use crate::problem::Problem;
 use crate::report::data::{
     EffectReport, FittedModel, HoldoutReport, Inputs, Location, ParameterReport, Report,
@@ -29,12 +29,18 @@ use select::{Selection, percent};
 use workbench::{Member, Model, Workbench};
 
 /// Structure left beside the named effects makes the explanation a partial one from this share of the residual on.
-const LEFT: f64 = 0.1;
+const LEFT: f64 = 0.04;
+/// What remains is too loud from this multiple of the stated noise on.
+const LOUD: f64 = 1.3;
+/// From this correlation on, what is left sits where the named effects act: their shape is wrong.
+const ALIKE: f64 = 0.35;
 /// From this ratio of what is left explainable to what the named effects explain on, their names are not to be trusted: another
 /// physics of the same shape would leave as much.
 const DOUBTFUL: f64 = 0.12;
 /// An effect that makes the error in another file larger by this factor is not that file's physics.
 const WORSE: f64 = 1.05;
+/// An interval whose ends differ by this factor says nothing.
+const VAGUE: f64 = 100.0;
 /// Folds for the figures of held-out blocks, each with a fit of its own.
 const FOLDS: usize = 5;
 
@@ -169,7 +175,8 @@ fn one(
     let before = features.explain(&selection.plain.residual, options.seed);
     let left = features.explain(&selection.fit.residual, options.seed);
     veto(&bench, &mut selection, problem, holdouts);
-    let verdict = judge(&bench, &mut selection, before, left);
+    vague(&bench, &mut selection, options.seed);
+    let verdict = judge(&bench, &mut selection, &features, before, left);
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);
@@ -277,6 +284,38 @@ fn veto(bench: &Workbench<'_>, selection: &mut Selection, problem: &Problem, hol
     }
 }
 
+/// Takes effects out again whose values the recording does not tell to within orders of magnitude.
+fn vague(bench: &Workbench<'_>, selection: &mut Selection, seed: u64) {
+    while !selection.named.is_empty() {
+        let intervals = intervals::intervals(bench, &selection.fit, seed);
+        let members = &selection.fit.model.members;
+        let found = members
+            .iter()
+            .zip(&intervals)
+            .position(|(member, intervals)| {
+                let parameters = member.effect.card().parameters;
+                parameters
+                    .iter()
+                    .zip(intervals)
+                    .any(|(parameter, [low, high])| {
+                        parameter.search == Search::Logarithmic
+                            && !parameter.internal
+                            && *high > VAGUE * low
+                    })
+            });
+        let Some(index) = found else {
+            return;
+        };
+        selection.refused.push(format!(
+            "{}: fits, but this recording does not tell its values",
+            members[index].id()
+        ));
+        let without = fit::fit(bench, &selection.fit.model.without(index), None);
+        selection.fit = fit::polish(bench, &without);
+        selection.rename(bench);
+    }
+}
+
 /// The model as it is taken to another file: how a file starts is its own, the physics is not.
 fn elsewhere(model: &Model) -> Model {
     Model {
@@ -292,12 +331,13 @@ fn elsewhere(model: &Model) -> Model {
 fn judge(
     bench: &Workbench<'_>,
     selection: &mut Selection,
+    features: &Features,
     before: Explainable,
     left: Explainable,
 ) -> Verdict {
     let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
     if selection.named.is_empty() {
-        return if before.is_real() && before.share > LEFT / 2.0 {
+        return if before.is_real() && before.share > LEFT {
             selection.decisions.push(format!(
                 "No effect passes, yet a smooth function of the recorded inputs takes {} of the held-out error (placebos up to {}): unknown.",
                 percent(before.share),
@@ -311,21 +351,61 @@ fn judge(
             Verdict::NoMismatch
         };
     }
-    let _ = bench;
+    let count = bench.len().max(1) as f64;
     let explained = energy(&selection.plain) - energy(&selection.fit);
-    let left_energy = left.share * energy(&selection.fit);
-    if left.is_real() && left.share > LEFT {
-        let ratio = left_energy / explained.max(1e-300);
+    let rest = energy(&selection.fit);
+    let smooth = if left.is_real() && left.share > LEFT {
+        left.share * rest
+    } else {
+        0.0
+    };
+    // What is beyond the noise that the design states is structure too, whatever the inputs say of it.
+    let noise = bench.problem.noise;
+    let known = noise.max(bench.problem.accuracy.zero);
+    let beyond = if noise > 0.0 && rest > (LOUD * known).powi(2) * count {
+        rest - known * known * count
+    } else {
+        0.0
+    };
+    if smooth > 0.0 {
         selection.decisions.push(format!(
             "Structure is left: a smooth function of the recorded inputs would take {} of what remains (placebos up to {}), {} of what the named effects take.",
             percent(left.share),
             percent(left.placebo_p99),
-            percent(ratio)
+            percent(smooth / explained.max(1e-300))
         ));
-        if ratio > DOUBTFUL {
+    }
+    if beyond > 0.0 {
+        selection.decisions.push(format!(
+            "What remains is {} times the noise that the model file states.",
+            short((rest / count).sqrt() / noise)
+        ));
+    }
+    if smooth > 0.0 || beyond > 0.0 {
+        let ratio = smooth.max(beyond) / explained.max(1e-300);
+        let change: Vec<f64> = selection
+            .fit
+            .predicted
+            .iter()
+            .zip(&selection.plain.predicted)
+            .map(|(after, before)| {
+                if (after - before).is_finite() {
+                    after - before
+                } else {
+                    0.0
+                }
+            })
+            .collect();
+        let (shape, change) = features.shape(&selection.fit.residual, &change);
+        let alike = if smooth > 0.0 {
+            correlation(&shape, &change)
+        } else {
+            0.0
+        };
+        if ratio > DOUBTFUL || alike > ALIKE {
             let ids = selection.fit.model.ids().join(", ");
             selection.refused.push(format!(
-                "{ids}: the best of the library, but so much structure is left that the true physics is likely another"
+                "{ids}: the best of the library, but so much structure is left, and where these effects act, that the true physics is likely another"
             ));
             selection.fit = selection.plain.clone();
             selection.named.clear();
@@ -342,6 +422,21 @@ fn judge(
     } else {
         Verdict::Explained
     }
+}
+
+/// Correlation of the sizes of two series.
+fn correlation(a: &[f64], b: &[f64]) -> f64 {
+    let count = a.len().max(1) as f64;
+    let mean = |series: &[f64]| series.iter().map(|v| v.abs()).sum::<f64>() / count;
+    let (ma, mb) = (mean(a), mean(b));
+    let (mut ab, mut aa, mut bb) = (0.0, 0.0, 0.0);
+    for (x, y) in a.iter().zip(b) {
+        let (x, y) = (x.abs() - ma, y.abs() - mb);
+        ab += x * y;
+        aa += x * x;
+        bb += y * y;
+    }
+    ab / (aa * bb).sqrt().max(1e-300)
 }
 
 /// Held-out blocks before and after, each fold predicted by a model fitted on the others; and the residuals.

@@ -84,6 +84,8 @@ pub struct Sensor {
     pub accuracy: AccuracySpec,
     /// The reference stays at its value until its next row.
     pub held_reference: bool,
+    /// Of a board: time from the end of a conversion to the earliest row that can tell of it, in s.
+    pub age_s: f64,
     /// Time by which readings stand for an earlier moment than their row, in s; `twin explain` finds it with an effect.
     pub alignment_s: f64,
 }
@@ -100,6 +102,8 @@ pub struct Charge {
     pub interval_s: Option<f64>,
     /// Noise of one reading of the counter, rms, in C.
     pub noise_c: f64,
+    /// Time from the counter's reading to the row that tells of it, in s.
+    pub age_s: f64,
 }
 
 /// `[battery]`, resolved: the table is read.
@@ -316,6 +320,7 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
             ("noise", sensor.noise),
             ("noise_coloured", sensor.noise_coloured),
             ("noise_coloured_tau_s", sensor.noise_coloured_tau_s),
+            ("age_s", sensor.age_s),
             ("full_scale", sensor.full_scale.unwrap_or(1.0)),
             ("range_limit", sensor.range_limit.unwrap_or(1.0)),
         ],
@@ -342,6 +347,13 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
                 &["sensor", "average"],
                 "a number of readings",
                 "window_s: front_end = \"pair\" has no sliding average of readings",
+            ));
+        }
+        if sensor.age_s > 0.0 {
+            return Err(places.fault(
+                &["sensor", "age_s"],
+                "a time",
+                "none: front_end = \"pair\" has no conversions",
             ));
         }
         return Ok(());
@@ -372,6 +384,7 @@ fn check_charge(charge: &Charge, places: &Places<'_>) -> Result<(), Failure> {
         &[
             ("step_c", charge.step_c),
             ("noise_c", charge.noise_c),
+            ("age_s", charge.age_s),
             ("interval_s", charge.interval_s.unwrap_or(0.0)),
         ],
     )

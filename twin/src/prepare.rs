@@ -8,6 +8,7 @@ mod charge;
 pub mod checks;
 mod frame;
 mod held;
+mod phase;
 mod series;
 
 use std::path::PathBuf;
@@ -287,7 +288,16 @@ impl Work<'_> {
             base.range_limit = board.range_limit_a();
             base.range_ratio = board.range_ratio();
             base.window_s = board.conversion_s() * f64::from(board.average());
-            let reported = board.run(&drive, sensor.held_reference, &observed, pace, false);
+            let run = |age_s: f64| {
+                let mut earlier = observed.clone();
+                earlier.t_s.iter_mut().for_each(|t| *t -= age_s);
+                board.run(&drive, sensor.held_reference, &earlier, pace, false)
+            };
+            let slack_s = match pace {
+                Pace::Seen => board.slack_s(&observed),
+                _ => 0.0,
+            };
+            let reported = phase::closest(sensor.age_s, slack_s, &observed, run);
             self.compare_range_flag(board, &mut drive, &observed, &reported.range_high);
             base.reading = reported.current_a;
             fresh = reported.fresh;

@@ -1,7 +1,7 @@
 //! Coarser steps.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage};
+use super::{Card, Clues, Effect, Mark, Parameter, Search, Stage};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -28,14 +28,22 @@ impl Effect for Quantisation {
     }
 
     fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>> {
-        // Readings on a grid betray their step; noise behind the staircase hides the grid, so a search over steps follows.
-        let mut starts: Vec<Vec<f64>> = lattice(clues.observed)
-            .into_iter()
-            .filter(|step| *step > 1.5 * scale.quantum)
+        // Noise behind the staircase hides the grid of the readings: the residual still goes with the stairs.
+        by_correlation(clues, scale)
             .map(|step| vec![step])
-            .collect();
-        starts.extend(by_correlation(clues, scale).map(|step| vec![step]));
-        starts
+            .into_iter()
+            .collect()
+    }
+
+    fn mark(&self, scale: &Scale, clues: &Clues<'_>) -> Option<Mark> {
+        let step = lattice(clues.observed)
+            .into_iter()
+            .find(|step| *step > 1.5 * scale.quantum)?;
+        Some(Mark {
+            values: vec![step],
+            // Evenly spread over a step.
+            variance: step * step / 12.0,
+        })
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

@@ -96,7 +96,7 @@ pub fn low_pass(
     held: bool,
 ) -> Vec<f64> {
     let mut output = input.to_vec();
-    if !(tau_s > 0.0) {
+    if tau_s.is_nan() || tau_s <= 0.0 {
         return output;
     }
     // Steps repeat, with some jitter: an exponential for each row would be most of the time.
@@ -146,15 +146,15 @@ pub fn ladder<const N: usize>(
                 let slot = &mut known[(nanos as u64 / 1_000_000) as usize % KNOWN];
                 if slot.0 != nanos {
                     slot.0 = nanos;
-                    for k in 0..N {
-                        let kept = (-h / taus_s[k]).exp();
+                    for (k, tau_s) in taus_s.iter().enumerate() {
+                        let kept = (-h / tau_s).exp();
                         slot.1[k] = kept;
-                        slot.2[k] = 1.0 - taus_s[k] / h * (1.0 - kept);
+                        slot.2[k] = 1.0 - tau_s / h * (1.0 - kept);
                     }
                 }
                 let (from, rise) = (input[row - 1], input[row] - input[row - 1]);
-                for k in 0..N {
-                    last[k] = slot.1[k] * (last[k] - from) + from + rise * slot.2[k];
+                for (k, last) in last.iter_mut().enumerate() {
+                    *last = slot.1[k] * (*last - from) + from + rise * slot.2[k];
                 }
             }
             let mut sum = 0.0;
@@ -251,7 +251,7 @@ pub fn boxcar(
     held: bool,
 ) -> Vec<f64> {
     let mut output = input.to_vec();
-    if !(window_s > 0.0) {
+    if window_s.is_nan() || window_s <= 0.0 {
         return output;
     }
     let total = integral(t_s, segments, input, held);
@@ -451,6 +451,7 @@ fn open_circuit_v(table: &[(f64, f64)], soc: f64, at: &mut usize) -> f64 {
 }
 
 #[cfg(test)]
+#[allow(clippy::single_range_in_vec_init, reason = "one segment")]
 mod tests {
     use super::*;
 

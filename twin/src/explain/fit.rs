@@ -134,7 +134,7 @@ impl Slope {
             .zip(&scaled)
             .map(|(s, scale)| (s * scale).powi(2))
             .sum();
-        if !(length > 0.0) {
+        if length.is_nan() || length <= 0.0 {
             return;
         }
         let mut missing: Vec<f64> = after

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 use rayon::prelude::*;
 
-use super::fit::{TUNING, dot, normal, spread};
+use super::fit::{TUNING, dot, normal, solve, spread};
 use super::screen::{held_out_gain, turned};
 use super::workbench::Workbench;
 use crate::effects::scene::{Cursor, low_pass};
@@ -136,6 +136,33 @@ impl Features {
     }
 }
 
+impl Features {
+    /// What they make of a residual, and another series, both at the features' own rows.
+    pub fn shape(&self, residual: &[f64], other: &[f64]) -> (Vec<f64>, Vec<f64>) {
+        let limit = TUNING * spread(residual);
+        let here: Vec<f64> = self
+            .rows
+            .iter()
+            .map(|&row| residual[row].clamp(-limit, limit))
+            .collect();
+        let size = self.columns.len();
+        let mut gram = DMatrix::zeros(size, size);
+        for part in &self.grams {
+            gram += part;
+        }
+        let right = DVector::from_fn(size, |k, _| dot(&self.columns[k], &here));
+        let factors = solve(&gram, &right, 1e-9);
+        let mut shape = vec![0.0; self.rows.len()];
+        for (column, factor) in self.columns.iter().zip(factors.iter()) {
+            shape
+                .iter_mut()
+                .zip(column)
+                .for_each(|(s, c)| *s += factor * c);
+        }
+        (shape, self.rows.iter().map(|&row| other[row]).collect())
+    }
+}
+
 /// A series on the drive's rows, at the rows of the observation.
 fn at_rows(bench: &Workbench<'_>, rows: &[usize], series: &[f64], earlier_s: f64) -> Vec<f64> {
     let drive = &bench.problem.drive;
@@ -196,6 +223,22 @@ fn columns(bench: &Workbench<'_>, rows: &[usize]) -> Vec<Vec<f64>> {
         let moved = at_rows(bench, rows, x, steps * scale.step_s);
         push(moved.iter().zip(&here).map(|(m, v)| m - v).collect());
     }
+    // What changes in the course of the recording.
+    let (first, last) = (bench.t_s[0], bench.t_s[bench.t_s.len() - 1]);
+    let course: Vec<f64> = rows
+        .iter()
+        .map(|&row| (bench.t_s[row] - first) / (last - first).max(1e-9) - 0.5)
+        .collect();
+    let moved = at_rows(bench, rows, x, scale.step_s);
+    push(course.iter().zip(&here).map(|(t, x)| t * x).collect());
+    push(
+        course
+            .iter()
+            .zip(moved.iter().zip(&here))
+            .map(|(t, (m, x))| t * (m - x))
+            .collect(),
+    );
+    push(course);
     let environment = [
         &drive.sensor_temperature_c,
         &drive.supply_v,
@@ -209,7 +252,7 @@ fn columns(bench: &Workbench<'_>, rows: &[usize]) -> Vec<Vec<f64>> {
         let mean = there.iter().sum::<f64>() / there.len().max(1) as f64;
         let centred: Vec<f64> = there.iter().map(|v| v - mean).collect();
         let spread = (dot(&centred, &centred) / centred.len().max(1) as f64).sqrt();
-        if !(spread > 1e-9 * mean.abs().max(1.0)) {
+        if spread.is_nan() || spread <= 1e-9 * mean.abs().max(1.0) {
             continue;
         }
         push(centred.iter().map(|v| v * v / spread).collect());

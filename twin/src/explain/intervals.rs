@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 
-use super::fit::{Fit, blocked, solve};
+use super::fit::{Fit, blocked, huber, solve};
 use super::workbench::Workbench;
 use crate::effects::Search;
 
@@ -53,8 +53,10 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> Vec<Vec<[f64; 2
                 .map(|(p, parameter)| {
                     let value = member.values[p];
                     if parameter.search == Search::Stepped {
-                        // The search ends at steps of 3·10⁻⁴.
-                        return [value * (1.0 - 5e-4), value * (1.0 + 5e-4)];
+                        return [
+                            profile(bench, fit, m, p, -1.0),
+                            profile(bench, fit, m, p, 1.0),
+                        ];
                     }
                     let mut values: Vec<f64> = draws
                         .iter()
@@ -73,4 +75,26 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> Vec<Vec<[f64; 2
                 .collect()
         })
         .collect()
+}
+
+/// How far a value can go to one side before the loss has risen by what bounds a 95 % interval (profile likelihood, χ² with one
+/// degree of freedom), the others staying.
+fn profile(bench: &Workbench<'_>, fit: &Fit, member: usize, parameter: usize, sign: f64) -> f64 {
+    const RISE: f64 = 0.5 * 3.84;
+    let value = fit.model.members[member].values[parameter];
+    let loss = |residual: &[f64]| residual.iter().map(|r| huber(r / fit.sigma)).sum::<f64>();
+    let here = loss(&fit.residual);
+    let mut share = 1e-6;
+    let mut last = value;
+    while share < 0.5 {
+        let there = value * (1.0 + sign * share);
+        let mut model = fit.model.clone();
+        model.members[member].values[parameter] = there;
+        if loss(&bench.residual(&bench.run(&model))) > here + RISE {
+            return there;
+        }
+        last = there;
+        share *= 1.6;
+    }
+    last
 }

@@ -132,7 +132,7 @@ fn at_rows(bench: &Workbench<'_>, series: &[f64]) -> Vec<f64> {
 pub fn locate(bench: &Workbench<'_>, residual: &[f64], seed: u64) -> Vec<Location> {
     let energy: Vec<f64> = residual.iter().map(|r| r * r).collect();
     let total: f64 = energy.iter().sum();
-    if !(total > 0.0) || residual.len() < 40 {
+    if total.is_nan() || total <= 0.0 || residual.len() < 40 {
         return Vec::new();
     }
     let mut random = ChaCha8Rng::seed_from_u64(seed);

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::fit::{Fit, fit, held_out, huber, polish};
+use super::fit::{Fit, fit, held_out, huber, polish, spread};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search, Stage, find};
@@ -13,11 +13,15 @@ const MOST_EFFECTS: usize = 6;
 const FITTED: usize = 8;
 /// First effects of pairs, and second ones of each.
 const FIRSTS: usize = 5;
+/// Pairs that are looked at, best first.
+const PAIRS: usize = 6;
 /// Starts of each that are fitted.
 const STARTS: usize = 2;
 /// A named effect takes away at least this share of the held-out squared error (2 % of the held-out rms), overall or where it
 /// acts.
 const FLOOR: f64 = 0.04;
+/// A smaller one takes away at least this share where it acts.
+const PLACE: f64 = 0.12;
 /// Rows where an effect changes the reading by at least this share of its largest change are where it acts.
 const ACTS: f64 = 0.2;
 /// Share of the held-out error from which on a single effect is clear by itself.
@@ -118,6 +122,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                     &screening,
                     single.as_ref().map(|(fit, _)| fit),
                     &mut decisions,
+                    &mut refused,
                 )
             } else {
                 None
@@ -168,6 +173,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
             }
         }
     };
+    let (now, named) = marked(bench, now, named, &mut decisions);
     Selection {
         plain,
         ids: now.model.ids(),
@@ -176,6 +182,70 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
         decisions,
         refused,
     }
+}
+
+/// Adds what the readings themselves show, without any simulation (a grid of values), and takes away what only imitated it.
+fn marked(
+    bench: &Workbench<'_>,
+    now: Fit,
+    mut named: Vec<Named>,
+    decisions: &mut Vec<String>,
+) -> (Fit, Vec<Named>) {
+    let mut now = now;
+    for effect in bench.library.iter().copied() {
+        let card = effect.card();
+        let Some(mark) = effect.mark(&bench.scale, &bench.clues(&now.predicted)) else {
+            continue;
+        };
+        let mut base = now.model.clone();
+        base.members
+            .retain(|member| member.id() != card.id && !card.looks_like.contains(&member.id()));
+        let energy =
+            now.residual.iter().map(|r| r * r).sum::<f64>() / now.residual.len().max(1) as f64;
+        let gain = (mark.variance / energy.max(1e-300)).min(1.0);
+        if gain < FLOOR {
+            continue;
+        }
+        decisions.push(format!(
+            "{} added: the readings lie on a grid; its steps make {} of the residual's energy.",
+            card.id,
+            percent(gain)
+        ));
+        let smooth = fit(bench, &base, None);
+        let model = smooth.model.with(Member {
+            effect,
+            values: mark.values,
+        });
+        let kept: Vec<Named> = named
+            .iter()
+            .filter_map(|one| {
+                let id = now.model.members[one.index].id();
+                let index = model.members.iter().position(|member| member.id() == id)?;
+                (id != card.id).then(|| Named {
+                    index,
+                    ..one.clone()
+                })
+            })
+            .collect();
+        named = kept;
+        named.push(Named {
+            index: model.members.len() - 1,
+            held_out_gain: gain,
+            placebo_p99: 0.0,
+            equivalent: Vec::new(),
+        });
+        // The other values are those of the smooth simulation: steps have no slope to fit by.
+        let predicted = bench.run(&model);
+        let residual = bench.residual(&predicted);
+        now = Fit {
+            sigma: spread(&residual),
+            model,
+            predicted,
+            residual,
+            cost: smooth.cost,
+        };
+    }
+    (now, named)
 }
 
 /// Fits the most promising entries in place of nothing.
@@ -238,6 +308,9 @@ fn step(
         if only_aligns(bench, now, &better, index) {
             continue;
         }
+        if gain <= 0.0 {
+            continue;
+        }
         if gain <= screening.placebo_p99 {
             note(
                 refused,
@@ -297,11 +370,11 @@ fn obstacle(
         .collect();
     let largest = change.iter().fold(0.0f64, |most, c| most.max(c.abs()));
     let (mut from, mut to, mut changed, mut accuracy, mut rows) = (0.0, 0.0, 0.0, 0.0, 0.0);
-    for row in 0..change.len() {
-        if change[row].abs() >= ACTS * largest && largest > 0.0 {
+    for (row, change) in change.iter().enumerate() {
+        if change.abs() >= ACTS * largest && largest > 0.0 {
             from += before.residual[row].powi(2);
             to += after.residual[row].powi(2);
-            changed += change[row].powi(2);
+            changed += change.powi(2);
             let known = bench.problem.accuracy;
             accuracy += (known.zero + known.gain * bench.plain[row].abs()).powi(2);
             rows += 1.0;
@@ -311,7 +384,7 @@ fn obstacle(
         return Some("changes nothing".into());
     }
     let there = 1.0 - to / f64::max(from, 1e-300);
-    if gain < FLOOR && there < FLOOR {
+    if gain < FLOOR && there < PLACE {
         return Some(format!(
             "real, but takes only {} of the held-out error ({} where it acts), below the practical floor of {}",
             percent(gain),
@@ -320,7 +393,13 @@ fn obstacle(
         ));
     }
     let noise = to / rows;
-    if card.stage == Stage::Output && changed / rows < noise {
+    if card.stage == Stage::Output
+        && card
+            .parameters
+            .iter()
+            .all(|parameter| parameter.search != Search::Linear)
+        && changed / rows < noise
+    {
         return Some("smaller than the noise where it acts".into());
     }
     if changed < accuracy {
@@ -374,6 +453,7 @@ fn pair(
     screening: &Screening,
     single: Option<&Fit>,
     decisions: &mut Vec<String>,
+    refused: &mut Vec<String>,
 ) -> Option<(Fit, f64)> {
     // What one effect explains so well needs no second one to be found.
     if single.is_some_and(|single| share(bench, now, single) > CLEAR) {
@@ -393,42 +473,82 @@ fn pair(
         .map(|(fit, _)| fit)
         .collect();
     let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
-    let best = fits
+    let mut ranked: Vec<(Fit, f64)> = fits
         .into_iter()
         .map(|fit| {
             let loss = losses(bench, &fit, sigma).1;
             (fit, loss)
         })
-        .min_by(|a, b| a.1.total_cmp(&b.1))?
-        .0;
-    let count = best.model.members.len();
-    let gain = share(bench, now, &best);
-    // Two effects may each gain what a placebo gains.
-    let chance = 1.0 - (1.0 - screening.placebo_p99.min(1.0)).powi(2);
-    if gain <= chance || gain < FLOOR {
-        return None;
-    }
-    if single.is_some_and(|single| share(bench, single, &best) < MUCH) {
-        return None;
-    }
-    // Each of the two has to be missed.
-    for index in count - 2..count {
-        let alone = fit(bench, &best.model.without(index), None);
-        let missed = share(bench, &alone, &best);
-        if missed <= screening.placebo_p99
-            || obstacle(bench, &alone, &best, index, missed).is_some()
-        {
-            return None;
-        }
-    }
+        .collect();
+    ranked.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let best = ranked
+        .into_iter()
+        .take(PAIRS)
+        .map(|(fit, _)| fit)
+        .find(
+            |best| match unfit(bench, now, best, screening.placebo_p99, single) {
+                Some(why) => {
+                    let ids = best.model.ids();
+                    let count = ids.len();
+                    note(
+                        refused,
+                        format!("{} with {}: {why}", ids[count - 2], ids[count - 1]),
+                    );
+                    false
+                }
+                None => true,
+            },
+        )?;
     let ids = best.model.ids();
+    let count = ids.len();
     decisions.push(format!(
         "{} and {} added together: both take {} of the held-out error, more than any one alone and than placebos.",
         ids[count - 2],
         ids[count - 1],
-        percent(gain)
+        percent(share(bench, now, &best))
     ));
     Some((best, screening.placebo_p99))
+}
+
+/// Why a pair, the last two effects of a fit, is not accepted.
+fn unfit(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    best: &Fit,
+    p99: f64,
+    single: Option<&Fit>,
+) -> Option<String> {
+    let count = best.model.members.len();
+    let gain = share(bench, now, best);
+    // Two effects may each gain what a placebo gains.
+    let chance = 1.0 - (1.0 - p99.min(1.0)).powi(2);
+    if gain <= chance || gain < FLOOR {
+        return Some(format!(
+            "takes {} of the held-out error, two placebos up to {}",
+            percent(gain),
+            percent(chance)
+        ));
+    }
+    if single.is_some_and(|single| share(bench, single, best) < MUCH) {
+        return Some("not much better than one effect alone".into());
+    }
+    // Each of the two has to be missed.
+    (count - 2..count).find_map(|index| {
+        let alone = fit(bench, &best.model.without(index), None);
+        let missed = share(bench, &alone, best);
+        let why = if missed <= p99 {
+            Some(format!(
+                "takes {}, placebos up to {}",
+                percent(missed),
+                percent(p99)
+            ))
+        } else if only_aligns(bench, &alone, best, index) {
+            Some("only aligns the samples".into())
+        } else {
+            obstacle(bench, &alone, best, index, missed)
+        };
+        why.map(|why| format!("{} {why}", best.model.members[index].id()))
+    })
 }
 
 fn p99_of(step_p99: &[(&'static str, f64)], id: &str) -> f64 {

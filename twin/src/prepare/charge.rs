@@ -32,7 +32,7 @@ pub(super) fn item(
     let spec = work.model.charge.clone().unwrap_or_default();
     let step_c = board.map_or(spec.step_c, Board::charge_step_c);
     let every = vec![true; value.len()];
-    let (readings, rows) = match &work.clock {
+    let (mut readings, rows) = match &work.clock {
         Some(clock) => series::own_rows(drive, clocks, work.frame.clocks(), clock, &value, &every),
         None => series::own_rows(
             drive,
@@ -43,6 +43,8 @@ pub(super) fn item(
             &every,
         ),
     };
+    // What the counter said then.
+    readings.t_s.iter_mut().for_each(|t| *t -= spec.age_s);
     let interval_s = spec.interval_s.unwrap_or(INTERVAL_S);
     let largest = drive
         .reference

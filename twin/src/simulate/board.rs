@@ -197,6 +197,22 @@ impl Board {
         charge.get() as f64 * 1e-9
     }
 
+    /// How closely the rows tell the time of the conversions on whose even grid they are placed, in s; 0 where they are placed
+    /// at the rows themselves.
+    ///
+    /// Each row is late by up to a step. Where the two periods have a common multiple, only a few latenesses occur, and the
+    /// mean of those is known to about a quarter of a step.
+    pub fn slack_s(&self, observed: &Observed) -> f64 {
+        let rows = 0..observed.t_s.len();
+        let step_s = row_step_s(observed, rows).unwrap_or(0.0);
+        let seen = observed.valid.iter().filter(|valid| **valid).count();
+        if tells_no_grid(observed, step_s, seen, self.conversion_s()) {
+            0.0
+        } else {
+            0.25 * step_s
+        }
+    }
+
     /// Readings in the sliding average.
     pub fn average(&self) -> u8 {
         self.average.length
@@ -382,17 +398,8 @@ impl Board {
 fn ends(observed: &Observed, rows: std::ops::Range<usize>, period_s: f64) -> Vec<f64> {
     let valid: Vec<usize> = rows.clone().filter(|row| observed.valid[*row]).collect();
     let times = || valid.iter().map(|row| observed.t_s[*row]);
-    let mut steps: Vec<f64> = observed.t_s[rows]
-        .windows(2)
-        .map(|pair| pair[1] - pair[0])
-        .collect();
-    if valid.len() < FEWEST_OF_A_GRID || steps.is_empty() {
-        return times().collect();
-    }
-    let middle = steps.len() / 2;
-    let step_s = *steps.select_nth_unstable_by(middle, f64::total_cmp).1;
-    // Without repeats between them the rows tell nothing of a grid.
-    if step_s <= 0.0 || step_s > 0.75 * period_s || valid.len() * 5 > observed.t_s.len() * 4 {
+    let step_s = row_step_s(observed, rows).unwrap_or(0.0);
+    if tells_no_grid(observed, step_s, valid.len(), period_s) {
         return times().collect();
     }
     // A value that stayed tells nothing either.
@@ -407,6 +414,24 @@ fn ends(observed: &Observed, rows: std::ops::Range<usize>, period_s: f64) -> Vec
             .collect(),
         None => times().collect(),
     }
+}
+
+/// Median step between rows.
+fn row_step_s(observed: &Observed, rows: std::ops::Range<usize>) -> Option<f64> {
+    let mut steps: Vec<f64> = observed.t_s[rows]
+        .windows(2)
+        .map(|pair| pair[1] - pair[0])
+        .collect();
+    let middle = steps.len() / 2;
+    (!steps.is_empty()).then(|| *steps.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// Without repeats between them the rows tell nothing of a grid.
+fn tells_no_grid(observed: &Observed, step_s: f64, seen: usize, period_s: f64) -> bool {
+    seen < FEWEST_OF_A_GRID
+        || step_s <= 0.0
+        || step_s > 0.75 * period_s
+        || seen * 5 > observed.t_s.len() * 4
 }
 
 /// Period and phase of the grid from which rows `step_s` apart see changes, each late by less than that.

@@ -1,0 +1,59 @@
+//! Where conversions lie between the rows that see them.
+
+use crate::{problem::Observed, simulate::board::Reported};
+
+/// Trials over the slack, to either side.
+const TRIALS: i32 = 10;
+/// Share of the rows that counts: those that fit worst are left to whatever explains them.
+const COUNTED: f64 = 0.95;
+
+/// What the board reports if its readings are as old as makes them fit best, within `slack_s` of `age_s`: so far the rows
+/// cannot tell it. A gain and an offset of each range are not held against a fit.
+pub(super) fn closest(
+    age_s: f64,
+    slack_s: f64,
+    observed: &Observed,
+    run: impl Fn(f64) -> Reported,
+) -> Reported {
+    let mut best = run(age_s);
+    let mut least = misfit(observed, &best);
+    if slack_s > 0.0 {
+        for trial in (-TRIALS..=TRIALS).filter(|trial| *trial != 0) {
+            let reported = run(age_s + slack_s * f64::from(trial) / f64::from(TRIALS));
+            let now = misfit(observed, &reported);
+            if now < least {
+                (best, least) = (reported, now);
+            }
+        }
+    }
+    best
+}
+
+/// Mean square of what a straight line in each range leaves.
+fn misfit(observed: &Observed, reported: &Reported) -> f64 {
+    let mut squares = Vec::new();
+    for high in [false, true] {
+        let pairs: Vec<(f64, f64)> = (0..observed.value.len())
+            .filter(|row| observed.valid[*row] && (reported.range_high[*row] > 0.5) == high)
+            .map(|row| (reported.current_a[row], observed.value[row]))
+            .filter(|(x, y)| x.is_finite() && y.is_finite())
+            .collect();
+        let count = pairs.len() as f64;
+        if pairs.len() < 3 {
+            continue;
+        }
+        let mean = |of: fn(&(f64, f64)) -> f64| pairs.iter().map(of).sum::<f64>() / count;
+        let (x, y) = (mean(|pair| pair.0), mean(|pair| pair.1));
+        let spread: f64 = pairs.iter().map(|pair| (pair.0 - x).powi(2)).sum();
+        let together: f64 = pairs.iter().map(|pair| (pair.0 - x) * (pair.1 - y)).sum();
+        let slope = if spread > 0.0 { together / spread } else { 1.0 };
+        squares.extend(
+            pairs
+                .iter()
+                .map(|pair| (pair.1 - y - slope * (pair.0 - x)).powi(2)),
+        );
+    }
+    squares.sort_by(f64::total_cmp);
+    let counted = (squares.len() as f64 * COUNTED).ceil() as usize;
+    squares[..counted].iter().sum::<f64>() / counted.max(1) as f64
+}

@@ -1,0 +1,324 @@
+//! Effects concealed in a real drive: the tool is given recording and as-designed model only, and has to name them.
+//!
+//! The drive is real (recordings/panasonic-18650pf, scaled to a vehicle's current); the effects are put in here, by loops of
+//! their own on a finer grid of time than the recording's. So these tests are evidence of kind (d): our own simulator. They
+//! guard against regressions and prove nothing more.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::path::Path;
+
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
+use twin::explain::{Options, explain};
+use twin::problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View};
+use twin::report::data::{Report, Verdict};
+
+const ROWS: usize = 9000;
+const STEP_S: f64 = 0.1;
+/// Steps of the finer grid in one of the recording.
+const FINE: usize = 50;
+/// Standard deviation of the noise, in A: stated in the model.
+const NOISE_A: f64 = 0.5;
+
+struct Truth {
+    t_s: Vec<f64>,
+    current_a: Vec<f64>,
+    temperature_c: Vec<f64>,
+    high: Vec<f64>,
+}
+
+fn truth() -> Truth {
+    let path =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/panasonic-18650pf/25c-us06.csv");
+    let recording = recording::csv::read(&path).unwrap();
+    let (t, i) = (recording.time_s(), recording.need("i_ref_a").unwrap());
+    let t_s: Vec<f64> = (0..ROWS).map(|k| k as f64 * STEP_S).collect();
+    let mut at = 0;
+    let current_a: Vec<f64> = t_s
+        .iter()
+        .map(|now| {
+            while t[at + 1] <= *now {
+                at += 1;
+            }
+            19.0 * (i[at] + (i[at + 1] - i[at]) * (now - t[at]) / (t[at + 1] - t[at]))
+        })
+        .collect();
+    let mut high = 0.0;
+    let flags = current_a
+        .iter()
+        .map(|i| {
+            if i.abs() > 53.33 {
+                high = 1.0;
+            } else if i.abs() < 51.0 {
+                high = 0.0;
+            }
+            high
+        })
+        .collect();
+    let temperature_c = t_s
+        .iter()
+        .map(|t| 25.0 + 14.0 * (t / 130.0).sin() + 4.0 * (t / 37.0).cos())
+        .collect();
+    Truth {
+        t_s,
+        current_a,
+        temperature_c,
+        high: flags,
+    }
+}
+
+fn noise(seed: u64) -> impl FnMut() -> f64 {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    // Twelve evenly spread numbers have variance one.
+    move || {
+        NOISE_A
+            * ((0..12)
+                .map(|_| f64::from(random.next_u32()) / f64::from(u32::MAX))
+                .sum::<f64>()
+                - 6.0)
+    }
+}
+
+/// Explains `reading` plus noise.
+fn explained(truth: &Truth, reading: Vec<f64>, seed: u64, without: &[&str]) -> Report {
+    let mut noise = noise(seed);
+    let value: Vec<f64> = reading.iter().map(|y| y + noise()).collect();
+    let rows = value.len();
+    let problem = Problem {
+        view: View::Sensor,
+        name: "i_meas_a".into(),
+        unit: "A".into(),
+        drive: Drive {
+            t_s: truth.t_s.clone(),
+            reference: truth.current_a.clone(),
+            sensor_temperature_c: Some(truth.temperature_c.clone()),
+            range_high: Some(truth.high.clone()),
+            segments: std::iter::once(0..rows).collect(),
+            continues: vec![false],
+            ..Drive::default()
+        },
+        observed: Observed {
+            t_s: truth.t_s.clone(),
+            value,
+            valid: vec![true; rows],
+            segment: vec![0; rows],
+            on_drive_rows: true,
+        },
+        base: Base::Sensor(SensorBase {
+            full_scale: Some(600.0),
+            range_ratio: 10.0,
+            ..SensorBase::default()
+        }),
+        modelled: Vec::new(),
+        noise: NOISE_A,
+        accuracy: Accuracy::default(),
+    };
+    let options = Options {
+        seed,
+        without: without.iter().map(|id| (*id).to_owned()).collect(),
+    };
+    explain(&[problem], &[], &options, &mut |_, _| {})
+}
+
+#[track_caller]
+fn assert_named(report: &Report, id: &str, parameters: &[(&str, f64, f64)]) {
+    assert!(
+        matches!(report.verdict, Verdict::Explained | Verdict::Ambiguous),
+        "{id}: {:?} {:?}",
+        report.verdict,
+        report.decisions
+    );
+    assert_eq!(report.effects.len(), 1, "{id}: {:?}", report.effects);
+    let effect = &report.effects[0];
+    assert!(
+        effect.id == id || effect.equivalent_to.iter().any(|other| other == id),
+        "{id}: {effect:?}"
+    );
+    for (name, value, tolerance) in parameters {
+        let found = effect.parameters.iter().find(|p| p.name == *name).unwrap();
+        assert!(
+            (found.value - value).abs() <= *tolerance,
+            "{id}: {found:?} for {value}"
+        );
+    }
+    assert!(effect.held_out_gain > effect.placebo_p99);
+}
+
+/// On the fine grid, straight lines between the recording's samples.
+fn fine(truth: &Truth) -> Vec<f64> {
+    (0..(ROWS - 1) * FINE + 1)
+        .map(|k| {
+            let (row, part) = (k / FINE, (k % FINE) as f64 / FINE as f64);
+            let here = truth.current_a[row];
+            if part == 0.0 {
+                here
+            } else {
+                here + (truth.current_a[row + 1] - here) * part
+            }
+        })
+        .collect()
+}
+
+#[test]
+fn nothing_is_found_where_nothing_is_concealed() {
+    let truth = truth();
+    for seed in 0..5 {
+        let report = explained(&truth, truth.current_a.clone(), seed, &[]);
+        assert_eq!(
+            report.verdict,
+            Verdict::NoMismatch,
+            "seed {seed}: {:?}",
+            report.effects
+        );
+    }
+}
+
+#[test]
+fn a_zero_error_and_a_sensitivity_error() {
+    let truth = truth();
+    let reading = truth.current_a.iter().map(|i| i + 0.4).collect();
+    assert_named(
+        &explained(&truth, reading, 1, &[]),
+        "offset",
+        &[("offset_a", 0.4, 0.03)],
+    );
+    let reading = truth.current_a.iter().map(|i| 0.985 * i).collect();
+    assert_named(
+        &explained(&truth, reading, 2, &[]),
+        "gain",
+        &[("gain", 0.985, 0.001)],
+    );
+}
+
+#[test]
+fn both_at_once() {
+    let truth = truth();
+    let reading = truth.current_a.iter().map(|i| 1.02 * i - 1.5).collect();
+    let report = explained(&truth, reading, 3, &[]);
+    let mut ids: Vec<&str> = report
+        .effects
+        .iter()
+        .map(|effect| effect.id.as_str())
+        .collect();
+    ids.sort_unstable();
+    assert_eq!(ids, ["gain", "offset"], "{:?}", report.decisions);
+}
+
+#[test]
+fn a_drift_with_temperature() {
+    let truth = truth();
+    let pairs = truth.current_a.iter().zip(&truth.temperature_c);
+    let reading = pairs.map(|(i, t)| i + 0.05 * (t - 25.0)).collect();
+    let report = explained(&truth, reading, 4, &[]);
+    assert_named(
+        &report,
+        "offset-temperature",
+        &[("tc_a_per_k", 0.05, 0.004)],
+    );
+}
+
+#[test]
+fn a_lag_and_what_is_said_without_it() {
+    let truth = truth();
+    let (tau_s, h) = (0.35, STEP_S / FINE as f64);
+    let mut y = truth.current_a[0];
+    let kept = (-h / tau_s).exp();
+    let fine = fine(&truth);
+    let mut reading = vec![y];
+    for k in 1..fine.len() {
+        y = kept * y + (1.0 - kept) * 0.5 * (fine[k] + fine[k - 1]);
+        if k % FINE == 0 {
+            reading.push(y);
+        }
+    }
+    assert_named(
+        &explained(&truth, reading.clone(), 5, &[]),
+        "lag",
+        &[("tau_s", tau_s, 0.005)],
+    );
+    let report = explained(&truth, reading, 5, &["lag"]);
+    assert_ne!(report.verdict, Verdict::Explained, "{:?}", report.effects);
+}
+
+#[test]
+fn a_window() {
+    let truth = truth();
+    let window_s = 0.8;
+    let rows = (window_s / STEP_S) as usize * FINE;
+    let fine = fine(&truth);
+    let mean = |end: usize| {
+        let value = |k: i64| fine[k.max(0) as usize];
+        let (end, rows) = (end as i64, rows as i64);
+        let inner: f64 = (end - rows + 1..end).map(value).sum();
+        (inner + 0.5 * (value(end) + value(end - rows))) / rows as f64
+    };
+    let reading = (0..ROWS).map(|row| mean(row * FINE)).collect();
+    let report = explained(&truth, reading, 6, &[]);
+    assert_named(&report, "moving-average", &[("window_s", window_s, 0.01)]);
+}
+
+#[test]
+fn a_second_sensor_that_disagrees() {
+    let truth = truth();
+    let pairs = truth.current_a.iter().zip(&truth.high);
+    let reading = pairs
+        .map(|(i, high)| if *high > 0.5 { 1.02 * i + 1.0 } else { *i })
+        .collect();
+    let report = explained(&truth, reading, 7, &[]);
+    assert_named(
+        &report,
+        "range-mismatch",
+        &[("gain_ratio", 1.02, 0.002), ("offset_a", 1.0, 0.2)],
+    );
+    let pairs = truth.current_a.iter().zip(&truth.high);
+    let reading = pairs
+        .map(|(i, high)| if *high > 0.5 { 1.02 * i + 1.0 } else { *i })
+        .collect();
+    let report = explained(&truth, reading, 7, &["range-mismatch"]);
+    assert_ne!(report.verdict, Verdict::Explained, "{:?}", report.effects);
+}
+
+#[test]
+fn a_rail_a_dead_band_and_a_hum() {
+    let truth = truth();
+    let reading = truth.current_a.iter().map(|i| i.min(180.0)).collect();
+    assert_named(
+        &explained(&truth, reading, 8, &[]),
+        "clipping",
+        &[("high_a", 180.0, 0.3)],
+    );
+    let reading = truth
+        .current_a
+        .iter()
+        .map(|i| if i.abs() < 4.0 { 0.0 } else { *i })
+        .collect();
+    assert_named(
+        &explained(&truth, reading, 9, &[]),
+        "dead-band",
+        &[("threshold_a", 4.0, 0.15)],
+    );
+    let pairs = truth.current_a.iter().zip(&truth.t_s);
+    let reading = pairs
+        .map(|(i, t)| i + 0.4 * (std::f64::consts::TAU * 1.7 * t + 1.0).sin())
+        .collect();
+    let report = explained(&truth, reading, 10, &[]);
+    assert_named(
+        &report,
+        "hum",
+        &[("frequency_hz", 1.7, 1e-3), ("amplitude_a", 0.4, 0.05)],
+    );
+}
+
+#[test]
+fn the_same_seed_gives_the_same_report() {
+    let truth = truth();
+    let reading: Vec<f64> = truth.current_a.iter().map(|i| 1.01 * i).collect();
+    let json = |report: &Report| {
+        let mut report = report.clone();
+        report.seconds = 0.0;
+        serde_json::to_string(&report).unwrap()
+    };
+    let one = json(&explained(&truth, reading.clone(), 11, &[]));
+    assert_eq!(one, json(&explained(&truth, reading, 11, &[])));
+}
