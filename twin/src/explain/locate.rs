@@ -128,7 +128,7 @@ fn at_rows(bench: &Workbench<'_>, series: &[f64]) -> Vec<f64> {
         .collect()
 }
 
-/// The places of a residual's energy, most telling first; at most [`MOST`] of each kind.
+/// The places of a residual's energy, most telling first; at most three of each kind.
 pub fn locate(bench: &Workbench<'_>, residual: &[f64], seed: u64) -> Vec<Location> {
     let energy: Vec<f64> = residual.iter().map(|r| r * r).collect();
     let total: f64 = energy.iter().sum();
