@@ -1,21 +1,130 @@
-//! `cargo xtask demo`: a recorded drive through the board's measuring logic.
+//! `cargo xtask demo`: an effect that the firmware does not know is found in the emulated board's own log, and one in a
+//! real recording.
+
+use std::{
+    path::Path,
+    process::Command,
+    time::{Duration, Instant},
+};
 
 use anyhow::Result;
 
-use crate::{process, workspace::Workspace};
+use crate::{emulate::tool, image, process, toolchain, workspace::Workspace};
 
 /// US06 of a 2.9 Ah cell; P. Kollmeyer, see recordings/panasonic-18650pf/README.md.
-const RECORDING: &str = "recordings/panasonic-18650pf/25c-us06.csv";
+const DRIVE: &str = "recordings/panasonic-18650pf/25c-us06.csv";
 /// Takes the cell's −7.6 … 20.8 A to the −144 … 396 A of a vehicle.
 const SCALE: &str = "19";
+/// A minute and a half of it with −85 … 287 A: both ranges, both signs.
+const PIECE: [&str; 4] = ["--skip", "280", "--duration", "90"];
+/// What is wrong with the board's sensors. Neither the image nor `twin` is told.
+const CONCEALED: &str = "large.gain=1.02";
+/// A graphics card's power sensor beside a power meter; see recordings/gpu-power-sensor/README.md.
+const CARD: &str = "recordings/gpu-power-sensor/rtx3090-5050";
 
-/// Builds and runs the example `drive` of `core-logic`.
+/// Builds, drives, explains; then says what each part took.
 pub fn run(workspace: &Workspace) -> Result<()> {
     let out = workspace.target_dir.join("demo");
-    let mut cargo = workspace.cargo();
-    cargo
-        .args(["run", "--quiet", "--release", "--package", "core-logic"])
-        .args(["--example", "drive", "--", RECORDING, SCALE])
-        .arg(&out);
-    process::run(&mut cargo)
+    let mut times = Vec::new();
+    let mut timed = |what: &str, work: &mut dyn FnMut() -> Result<()>| {
+        println!("\n== {what}");
+        let start = Instant::now();
+        let result = work();
+        times.push((what.to_owned(), start.elapsed()));
+        result
+    };
+
+    let (mut elf, mut tools) = (None, None);
+    timed("Building the image, the emulator and twin", &mut || {
+        let toolchain = toolchain::choose(workspace)?;
+        elf = Some(image::build(workspace, &toolchain)?);
+        let in_root = |mut program: Command| {
+            program.current_dir(&workspace.root);
+            program
+        };
+        tools = Some((
+            in_root(tool(workspace, "emulator", "emulate")?),
+            in_root(tool(workspace, "twin", "twin")?),
+        ));
+        Ok(())
+    })?;
+    let (Some(elf), Some((emulate, twin))) = (elf, tools) else {
+        anyhow::bail!("nothing was built");
+    };
+
+    timed(
+        "A recorded drive on the emulated board, which executes the image",
+        &mut || {
+            println!(
+                "90 s of {DRIVE} × {SCALE}. Concealed from the firmware and from twin: {CONCEALED},\n\
+                 that is, the large Hall sensor is 2 % too sensitive."
+            );
+            let mut drive = again(&emulate);
+            drive
+                .args(["drive", "--profile", DRIVE, "--scale", SCALE])
+                .args(PIECE)
+                .args(["--sensor", CONCEALED, "--image"])
+                .arg(&elf)
+                .arg("--out")
+                .arg(&out);
+            process::run(&mut drive)
+        },
+    )?;
+
+    let board = out.join("board");
+    timed("What twin makes of the board's log", &mut || {
+        let mut explain = again(&twin);
+        explain
+            .args(["explain", "--model", "models/board-dual-range.toml"])
+            .arg("--recording")
+            .arg(out.join("board.csv"))
+            .arg("--out")
+            .arg(&board);
+        process::run(&mut explain)
+    })?;
+
+    let card = out.join("gpu");
+    timed("What twin makes of a real recording", &mut || {
+        println!(
+            "{CARD}: the power sensor of a graphics card, and a power meter with a clock of its own.\n\
+             Known from a publication: the sensor shows the mean of the last second."
+        );
+        let mut explain = again(&twin);
+        explain
+            .args(["explain", "--model", "models/gpu-power-sensor.toml"])
+            .args(["--recording", &format!("{CARD}-sensor.csv")])
+            .args(["--reference", &format!("{CARD}-reference.csv")])
+            .arg("--out")
+            .arg(&card);
+        process::run(&mut explain)
+    })?;
+
+    println!("\n== Reports, to open in a browser");
+    for folder in [&board, &card] {
+        println!("{}", shown(workspace, &folder.join("report.html")));
+    }
+    println!("\n== Time");
+    let in_all: Duration = times.iter().map(|(_, taken)| *taken).sum();
+    for (what, taken) in &times {
+        println!("{:8.1} s  {what}", taken.as_secs_f64());
+    }
+    println!("{:8.1} s  in all", in_all.as_secs_f64());
+    Ok(())
+}
+
+/// The same program anew, from the workspace's own folder.
+fn again(program: &Command) -> Command {
+    let mut command = Command::new(program.get_program());
+    if let Some(folder) = program.get_current_dir() {
+        command.current_dir(folder);
+    }
+    command
+}
+
+/// A path as one would type it.
+fn shown(workspace: &Workspace, path: &Path) -> String {
+    path.strip_prefix(&workspace.root)
+        .unwrap_or(path)
+        .display()
+        .to_string()
 }

@@ -47,7 +47,7 @@ const MISSING: u8 = 2;
     about = "The commands of the Hallmark board"
 )]
 #[command(
-    after_help = "Examples:\n  cargo xtask demo      a recorded drive through the measuring logic\n  cargo xtask test      set up what is missing, then run every check and test\n  cargo xtask emulate --profile recordings/panasonic-18650pf/25c-us06.csv --scale 19 --duration 600\n                        the same drive on the emulated board, which runs the firmware image"
+    after_help = "Examples:\n  cargo xtask demo      find an effect that is concealed in the emulated board, and one in a real recording\n  cargo xtask test      set up what is missing, then run every check and test\n  cargo xtask emulate --profile recordings/panasonic-18650pf/25c-us06.csv --scale 19 --duration 600\n                        the same drive on the emulated board, which runs the firmware image"
 )]
 struct CommandLine {
     #[command(subcommand)]
@@ -56,7 +56,7 @@ struct CommandLine {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Drive a recorded current through the measuring logic and say what it made of it
+    /// Find the effect that is concealed in an emulated drive, and the one in a real recording
     #[command(after_help = "Example:\n  cargo xtask demo")]
     Demo,
     /// Set up what is missing, then run every check and every test
@@ -156,6 +156,10 @@ fn run(command: &Command) -> Result<ExitCode> {
             eprintln!(
                 "ngspice: {}",
                 apt::program(test_command::NGSPICE)?.display()
+            );
+            eprintln!(
+                "chromium: {}",
+                apt::program(test_command::CHROMIUM)?.display()
             );
             let python = python::environment(&workspace)?;
             eprintln!("python: {}", python.display());

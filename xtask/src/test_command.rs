@@ -12,6 +12,9 @@ use crate::{
 /// The circuit simulator, and Debian's package of it.
 pub const NGSPICE: &str = "ngspice";
 
+/// The browser that opens the report's page, and Debian's package of it.
+pub const CHROMIUM: &str = "chromium";
+
 /// Runs every check, then every test; `true` if all is well. A check that fails does not keep the next from running.
 pub fn run(workspace: &Workspace) -> Result<bool> {
     let mut steps = Steps::default();
@@ -28,6 +31,11 @@ pub fn run(workspace: &Workspace) -> Result<bool> {
         println!("   {}", qemu::find()?.display());
         println!("   {}", apt::program(NGSPICE)?.display());
         Ok(())
+    });
+    let chromium = steps.step("set-up: Chromium", || {
+        let program = apt::program(CHROMIUM)?;
+        println!("   {}", program.display());
+        Ok(program)
     });
     let python = steps.step("set-up: Python", || python::environment(workspace));
     let logs = match &python {
@@ -75,6 +83,7 @@ pub fn run(workspace: &Workspace) -> Result<bool> {
         ("HALLMARK_CPU_PROGRAMS", programs),
         ("HALLMARK_PYTHON", python),
         ("HALLMARK_FOREIGN_LOGS", logs),
+        ("HALLMARK_CHROMIUM", chromium),
     ];
     let mut summary = None;
     steps.step("tests", || {
