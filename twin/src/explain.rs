@@ -30,6 +30,8 @@ use workbench::{Member, Model, Workbench};
 
 /// Structure left beside the named effects makes the explanation a partial one from this share of the residual on.
 const LEFT: f64 = 0.04;
+/// A mismatch that no effect explains is one from this share within reach of the inputs on.
+const STRUCTURE: f64 = 0.1;
 /// What remains is too loud from this multiple of the stated noise on.
 const LOUD: f64 = 1.3;
 /// From this correlation on, what is left sits where the named effects act: their shape is wrong.
@@ -337,7 +339,7 @@ fn judge(
 ) -> Verdict {
     let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
     if selection.named.is_empty() {
-        return if before.is_real() && before.share > LEFT {
+        return if before.is_real() && before.share > STRUCTURE {
             selection.decisions.push(format!(
                 "No effect passes, yet a smooth function of the recorded inputs takes {} of the held-out error (placebos up to {}): unknown.",
                 percent(before.share),

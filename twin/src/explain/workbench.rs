@@ -11,8 +11,8 @@ use crate::problem::{Base, Problem};
 const MOST_ROWS: usize = 250_000;
 /// Blocks that are held out in turn.
 const BLOCKS: usize = 24;
-/// Rows that a block has at least.
-const LEAST_ROWS: usize = 12;
+/// Rows that a block has at least: with fewer than eight blocks, random signs would be all the same too often to be placebos.
+const LEAST_ROWS: usize = 6;
 /// Share of a block that is left out at its end, so that neighbours do not tell each other's noise.
 const GUARD: f64 = 0.08;
 
