@@ -664,7 +664,13 @@ impl Sink {
         Ok(())
     }
 
-    fn finish(self, text: &str, json: &str) -> Result<()> {
+    fn finish(mut self, text: &str, json: &str) -> Result<()> {
+        // The truth ends a sample before the run does.
+        while let Some(logged) = self.frames.pop_front() {
+            self.truth_until(logged.at.seconds())?;
+            self.view.take(logged.at, &logged.frame);
+            self.tell(&logged)?;
+        }
         let files = Outputs::in_folder(&self.folder.path);
         let mut finished = vec![];
         for file in [self.can_log, self.rs485_log, self.defmt_log] {
