@@ -41,6 +41,8 @@ const ALIKE: f64 = 0.35;
 const DOUBTFUL: f64 = 0.12;
 /// An effect that makes the error in another file larger by this factor is not that file's physics.
 const WORSE: f64 = 1.05;
+/// A file that was never fitted confirms the effects if they bring its error down to this share.
+const CONFIRMED: f64 = 0.6;
 /// An interval whose ends differ by this factor says nothing.
 const VAGUE: f64 = 100.0;
 /// Folds for the figures of held-out blocks, each with a fit of its own.
@@ -175,10 +177,11 @@ fn one(
     progress(0.95, "looking at what is left");
     let features = Features::new(&bench);
     let before = features.explain(&selection.plain.residual, options.seed);
-    let left = features.explain(&selection.fit.residual, options.seed);
     veto(&bench, &mut selection, problem, holdouts);
     vague(&bench, &mut selection, options.seed);
-    let verdict = judge(&bench, &mut selection, &features, before, left);
+    let left = features.explain(&selection.fit.residual, options.seed);
+    let confirmed = confirmed(&selection, problem, holdouts);
+    let verdict = judge(&bench, &mut selection, &features, confirmed, before, left);
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);
@@ -242,6 +245,26 @@ fn one(
 
 fn jumps(residual: &[f64]) -> Vec<f64> {
     residual.windows(2).map(|pair| pair[1] - pair[0]).collect()
+}
+
+/// Whether every file that was never fitted is predicted much better with the effects than without.
+fn confirmed(selection: &Selection, problem: &Problem, holdouts: &[Holdout]) -> bool {
+    let mut any = false;
+    let others = holdouts
+        .iter()
+        .flat_map(|holdout| &holdout.problems)
+        .filter(|other| other.name == problem.name);
+    for other in others {
+        any = true;
+        let bench = Workbench::new(other, &[]);
+        let after = rms(bench
+            .residual(&bench.run(&elsewhere(&selection.fit.model)))
+            .into_iter());
+        if after > CONFIRMED * rms(bench.residual(&bench.plain).into_iter()) {
+            return false;
+        }
+    }
+    any
 }
 
 /// Takes effects out again that make the prediction of files that were never fitted worse.
@@ -334,6 +357,7 @@ fn judge(
     bench: &Workbench<'_>,
     selection: &mut Selection,
     features: &Features,
+    confirmed: bool,
     before: Explainable,
     left: Explainable,
 ) -> Verdict {
@@ -404,7 +428,7 @@ fn judge(
         } else {
             0.0
         };
-        if ratio > DOUBTFUL || alike > ALIKE {
+        if !confirmed && (ratio > DOUBTFUL || alike > ALIKE) {
             let ids = selection.fit.model.ids().join(", ");
             selection.refused.push(format!(
                 "{ids}: the best of the library, but so much structure is left, and where these effects act, that the true physics is likely another"
