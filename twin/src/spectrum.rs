@@ -28,7 +28,7 @@ fn grid(t_s: &[f64], values: &[f64], step_s: f64) -> Option<(Vec<Complex<f64>>, 
         return None;
     }
     let count = ((last - first) / step_s).round() as usize + 1;
-    if count < 16 || count > 8 * MOST {
+    if !(16..=8 * MOST).contains(&count) {
         return None;
     }
     let mut grid = vec![Complex::new(0.0, 0.0); count];
