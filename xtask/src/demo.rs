@@ -2,7 +2,6 @@
 //! real recording.
 
 use std::{
-    path::Path,
     process::Command,
     time::{Duration, Instant},
 };
@@ -24,7 +23,12 @@ const CARD: &str = "recordings/gpu-power-sensor/rtx3090-5050";
 
 /// Builds, drives, explains; then says what each part took.
 pub fn run(workspace: &Workspace) -> Result<()> {
-    let out = workspace.target_dir.join("demo");
+    // Short in what is printed: the tools run in the top folder.
+    let target = &workspace.target_dir;
+    let out = target
+        .strip_prefix(&workspace.root)
+        .unwrap_or(target)
+        .join("demo");
     let mut times = Vec::new();
     let mut timed = |what: &str, work: &mut dyn FnMut() -> Result<()>| {
         println!("\n== {what}");
@@ -101,7 +105,7 @@ pub fn run(workspace: &Workspace) -> Result<()> {
 
     println!("\n== Reports, to open in a browser");
     for folder in [&board, &card] {
-        println!("{}", shown(workspace, &folder.join("report.html")));
+        println!("{}", folder.join("report.html").display());
     }
     println!("\n== Time");
     let in_all: Duration = times.iter().map(|(_, taken)| *taken).sum();
@@ -119,12 +123,4 @@ fn again(program: &Command) -> Command {
         command.current_dir(folder);
     }
     command
-}
-
-/// A path as one would type it.
-fn shown(workspace: &Workspace, path: &Path) -> String {
-    path.strip_prefix(&workspace.root)
-        .unwrap_or(path)
-        .display()
-        .to_string()
 }
