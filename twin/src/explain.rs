@@ -657,9 +657,16 @@ fn sentence(
         ),
         Verdict::Explained => format!("{name}: explained by {} ({figures}).", ids.join(" and ")),
         Verdict::PartlyExplained => format!(
-            "{name}: partly explained by {} ({figures}); structure is left, {} of it within reach of the recorded inputs.",
+            "{name}: partly explained by {} ({figures}); {}.",
             ids.join(" and "),
-            percent(left.share)
+            if left.is_real() {
+                format!(
+                    "structure is left, {} of it within reach of the recorded inputs",
+                    percent(left.share)
+                )
+            } else {
+                "what remains is louder than the stated noise".to_owned()
+            }
         ),
         Verdict::Ambiguous => format!(
             "{name}: explained by {} ({figures}); this recording cannot tell them apart.",
