@@ -101,6 +101,8 @@ pub struct Parameter {
     pub search: Search,
     /// Needed to run the model, and no property of the physics (a phase): it is not reported.
     pub internal: bool,
+    /// The end of its bounds is a value like any other (a rail out of reach, a window without a pause).
+    pub open: bool,
 }
 
 impl Parameter {
@@ -111,7 +113,13 @@ impl Parameter {
             off,
             search,
             internal: false,
+            open: false,
         }
+    }
+
+    const fn open(mut self) -> Self {
+        self.open = true;
+        self
     }
 
     const fn internal(name: &'static str, unit: &'static str, off: f64, search: Search) -> Self {
@@ -121,6 +129,7 @@ impl Parameter {
             off,
             search,
             internal: true,
+            open: false,
         }
     }
 }

@@ -12,8 +12,8 @@ static CARD: Card = Card {
     statement: "The output stops at a rail: larger readings do not exist.",
     equation: "y = min(max(i, low), high)",
     parameters: &[
-        Parameter::new("high_a", "A", f64::INFINITY, Search::Smooth),
-        Parameter::new("low_a", "A", f64::NEG_INFINITY, Search::Smooth),
+        Parameter::new("high_a", "A", f64::INFINITY, Search::Smooth).open(),
+        Parameter::new("low_a", "A", f64::NEG_INFINITY, Search::Smooth).open(),
     ],
     shows: "flat tops",
     looks_like: &["core-saturation"],

@@ -27,7 +27,7 @@ impl Effect for DeadBand {
         (0.0, scale.full_scale)
     }
 
-    fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>> {
+    fn starts(&self, _scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>> {
         let mut sizes: Vec<f64> = clues
             .predicted
             .iter()
@@ -38,8 +38,6 @@ impl Effect for DeadBand {
             return Vec::new();
         }
         sizes.sort_unstable_by(f64::total_cmp);
-        let smallest = sizes[sizes.len() / 200].max(1e-5 * scale.full_scale);
-        let _ = smallest;
         [0.01, 0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.3, 0.4, 0.5]
             .map(|share| vec![sizes[(sizes.len() as f64 * share) as usize]])
             .into_iter()

@@ -39,8 +39,7 @@ impl Effect for OcvHysteresis {
         }
     }
 
-    fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
-        let _ = scale;
+    fn starts(&self, _scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
         spaced(3.0, 1000.0, 6)
             .into_iter()
             .map(|gamma| vec![0.005, gamma])

@@ -14,7 +14,7 @@ static CARD: Card = Card {
     equation: "R(SoC) = R·(1 + rise·(1 − SoC/knee)) below the knee",
     parameters: &[
         Parameter::new("rise", "1", 0.0, Search::Linear),
-        Parameter::new("knee_soc", "1", 0.3, Search::Smooth),
+        Parameter::new("knee_soc", "1", 0.3, Search::Smooth).open(),
     ],
     shows: "low state of charge",
     looks_like: &["resistance-temperature"],
@@ -39,8 +39,7 @@ impl Effect for ResistanceSoc {
         }
     }
 
-    fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
-        let _ = scale;
+    fn starts(&self, _scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
         [0.15, 0.3, 0.5, 0.8].map(|knee| vec![0.1, knee]).to_vec()
     }
 

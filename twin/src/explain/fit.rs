@@ -226,14 +226,14 @@ fn coordinates(bench: &Workbench<'_>, model: &Model) -> Vec<(Coordinate, f64, f6
                         (1e-3 * (value - off).abs()).max(1e-7 * (high - low).abs()),
                     )
                 }
-                Search::Smooth => (false, step_of(bench, parameter.name, value, low, high)),
+                Search::Smooth => (false, step_of(bench, parameter.unit, value, low, high)),
             };
             all.push((Coordinate::Value(m, p, logarithmic), step, 0.0, 0.0));
         }
     }
     if let Base::Battery(base) = &bench.problem.base {
         let inverse = |sigma: f64| 1.0 / (sigma * sigma);
-        if base.initial_soc_sigma > 0.0 && !model.has("soc-start") {
+        if base.initial_soc_sigma > 0.0 {
             all.push((
                 Coordinate::SocShift,
                 1e-5,
@@ -261,13 +261,14 @@ fn coordinates(bench: &Workbench<'_>, model: &Model) -> Vec<(Coordinate, f64, f6
     all
 }
 
-fn step_of(bench: &Workbench<'_>, name: &str, value: f64, low: f64, high: f64) -> f64 {
+/// A small step of a smooth parameter, by its unit: times move readings by a fraction of the sampling.
+fn step_of(bench: &Workbench<'_>, unit: &str, value: f64, low: f64, high: f64) -> f64 {
     let scale = &bench.scale;
-    match name {
-        "delay_s" | "since_s" => 0.02 * scale.step_s,
-        "skew_ppm" => (0.02 * scale.step_s / scale.span_s.max(1e-9)) * 1e6,
-        "frequency_hz" => 0.01 / scale.span_s.max(1e-9),
-        "phase_rad" => 1e-3,
+    match unit {
+        "s" => 0.02 * scale.step_s,
+        "ppm" => (0.02 * scale.step_s / scale.span_s.max(1e-9)) * 1e6,
+        "Hz" => 0.01 / scale.span_s.max(1e-9),
+        "rad" => 1e-3,
         _ => (1e-3 * value.abs()).max(1e-6 * (high - low).abs()),
     }
 }

@@ -428,14 +428,9 @@ fn obstacle(
         } else {
             None
         };
-        // Clipping on one side leaves the other rail out of reach; a full duty is a window without pause.
-        let allowed = matches!(
-            parameter.name,
-            "high_a" | "low_a" | "duty" | "softness" | "knee_soc"
-        );
         if let Some(end) = end
             && end != 0.0
-            && !allowed
+            && !parameter.open
         {
             return Some(format!(
                 "{} would be at the end of what is physics, {end:.4}",

@@ -118,7 +118,7 @@ impl<'a> Workbench<'a> {
             Base::Battery(_) => nearest(problem, &rows),
         };
         let scale = scale(problem, &t_s, &y, &plain);
-        let blocks = blocks(&rows, problem);
+        let blocks = blocks(&rows);
         let library = LIBRARY
             .iter()
             .copied()
@@ -282,10 +282,9 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
     scale
 }
 
-/// Blocks of equal numbers of rows; none reaches over a change of segment that starts a new operation by more than it must.
-fn blocks(rows: &[usize], problem: &Problem) -> Vec<Range<usize>> {
+/// Blocks of equal numbers of rows.
+fn blocks(rows: &[usize]) -> Vec<Range<usize>> {
     let count = (rows.len() / LEAST_ROWS).clamp(1, BLOCKS);
-    let _ = problem;
     (0..count)
         .map(|block| {
             let start = rows.len() * block / count;
