@@ -54,6 +54,17 @@ impl<'a> Chain<'a> {
 
     /// What the simulation says at each observed row; NaN where the drive does not reach.
     pub fn run(&self, members: &Members<'_>, nuisance: Nuisance) -> Vec<f64> {
+        self.run_with_noise(members, nuisance, &[])
+    }
+
+    /// The same with noise of the sensor, one value for each observed row, ahead of what ends the chain (steps, thresholds,
+    /// rails).
+    pub fn run_with_noise(
+        &self,
+        members: &Members<'_>,
+        nuisance: Nuisance,
+        noise: &[f64],
+    ) -> Vec<f64> {
         let problem = self.problem;
         let mut scene = Scene::new(problem);
         let mut order: Vec<(&'static dyn Effect, &[f64])> = problem
@@ -98,6 +109,11 @@ impl<'a> Chain<'a> {
                     .iter_mut()
                     .zip(&self.beside)
                     .for_each(|(value, beside)| *value += beside);
+                scene
+                    .signal
+                    .iter_mut()
+                    .zip(noise)
+                    .for_each(|(value, noise)| *value += noise);
                 apply_through(&mut scene, Stage::BatteryVoltage);
             }
             Base::Battery(_) => {

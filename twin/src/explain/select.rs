@@ -466,6 +466,8 @@ fn pair(
             fits(bench, first, &next.entries, FIRSTS, 1)
         })
         .map(|(fit, _)| fit)
+        // One more branch of the first is no second effect.
+        .filter(|fit| fit.model.members.len() == now.model.members.len() + 2)
         .collect();
     let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
     let mut ranked: Vec<(Fit, f64)> = fits
@@ -633,9 +635,22 @@ fn swapped(bench: &Workbench<'_>, now: &Fit) -> Vec<(usize, Fit)> {
             let id = now.model.members[index].id();
             let without = fit(bench, &now.model.without(index), None);
             let rivals = rivals(bench, &without, &now.model, id);
-            rivals
+            // An alignment that is free can take over what a rival explains, and leave it nothing to be named for.
+            let models: Vec<Model> = rivals
+                .into_iter()
+                .map(|rival| without.model.with(rival))
+                .flat_map(|model| {
+                    let unaligned = bench.aligns(&model).then(|| Model {
+                        unaligned: true,
+                        ..model.clone()
+                    });
+                    [Some(model), unaligned]
+                })
+                .flatten()
+                .collect();
+            models
                 .into_par_iter()
-                .map(|rival| (index, fit(bench, &without.model.with(rival), None)))
+                .map(|model| (index, fit(bench, &model, None)))
                 .collect::<Vec<_>>()
         })
         .collect()

@@ -2,6 +2,10 @@
 
 use std::ops::Range;
 
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng as _;
+use rand_distr::{Distribution as _, StandardNormal};
+
 use crate::effects::chain::{Chain, Nuisance};
 use crate::effects::scene::Scale;
 use crate::effects::{Clues, Effect, LIBRARY, Stage};
@@ -45,6 +49,8 @@ pub struct Model {
     pub members: Vec<Member>,
     /// The base.
     pub nuisance: Nuisance,
+    /// Samples stand at their rows, though an effect works between them.
+    pub unaligned: bool,
 }
 
 impl Model {
@@ -163,6 +169,31 @@ impl<'a> Workbench<'a> {
         self.chain.run(&members, model.nuisance)
     }
 
+    /// Squared change, summed over the rows that count, that noise of a standard deviation ahead of the end of the chain makes to
+    /// the simulation: a reading near a threshold jumps by noise, and a stepped one has the steps twice.
+    pub fn noise_energy(&self, model: &Model, predicted: &[f64], deviation: f64, seed: u64) -> f64 {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let noise: Vec<f64> = StandardNormal
+            .sample_iter(&mut random)
+            .take(self.problem.observed.t_s.len())
+            .map(|value: f64| deviation * value)
+            .collect();
+        let members: Vec<(&'static dyn Effect, &[f64])> = model
+            .members
+            .iter()
+            .map(|member| (member.effect, member.values.as_slice()))
+            .collect();
+        let noisy = self
+            .chain
+            .run_with_noise(&members, model.nuisance, &noise);
+        self.rows
+            .iter()
+            .zip(predicted)
+            .map(|(&row, predicted)| (noisy[row] - predicted).powi(2))
+            .filter(|change| change.is_finite())
+            .sum()
+    }
+
     /// The simulation at the rows that count.
     pub fn run(&self, model: &Model) -> Vec<f64> {
         let all = self.everywhere(model);
@@ -191,6 +222,7 @@ impl<'a> Workbench<'a> {
     /// Whether the sub-step alignment is free in a model: an effect works on what is between the samples.
     pub fn aligns(&self, model: &Model) -> bool {
         matches!(self.problem.base, Base::Sensor(_))
+            && !model.unaligned
             && !model.has("delay")
             && model.members.iter().any(|member| {
                 matches!(member.effect.card().stage, Stage::Filter | Stage::Converter)
