@@ -14,6 +14,8 @@ import pathlib
 import sys
 import tempfile
 
+sys.dont_write_bytecode = True
+
 MAKERS = ("sensing", "circuits", "cells", "battery")
 NOISES = ("white", "coloured", "quantised", "none")
 FIELDS = {
@@ -56,12 +58,13 @@ def make(case_path: pathlib.Path, out: pathlib.Path) -> None:
     """Makes one case; its files appear in `out` when all of them are complete."""
     case = checked(read(case_path), str(case_path))
     maker = importlib.import_module(case["maker"])
-    out.mkdir(parents=True, exist_ok=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".making-") as made:
         try:
             maker.make(case, pathlib.Path(made))
         except (ValueError, RuntimeError, OSError) as error:
             raise ValueError(f"{case_path}: {case['id']}: {error}") from error
+        out.mkdir(exist_ok=True)
         for file in pathlib.Path(made).iterdir():
             os.replace(file, out / file.name)
 

@@ -97,10 +97,25 @@ def range_mismatch(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarra
 
 
 def range_handover(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarray:
-    """The multiplier's low-pass keeps the product in the old range's scale. On the fine grid."""
-    scale = np.where(stretch.range_fine, RANGE_RATIO, 1.0)
-    step_s = stretch.step_s / FINE
-    return y + scale * low_pass(y / scale, step_s, values["tau_s"]) - low_pass(y, step_s, values["tau_s"])
+    """The multiplier's low-pass keeps the product in the old range's scale. On the fine grid, changes midway between its points.
+
+    The product's error decays between changes; at a change what the low-pass holds is read in the new scale.
+    """
+    step_s, tau_s = stretch.step_s / FINE, values["tau_s"]
+    held = low_pass(y, step_s, tau_s)
+    large = stretch.range_fine
+    after = np.arange(len(y)) * step_s / tau_s
+    error = np.zeros(len(y))
+    now = began = 0.0
+    changes = np.flatnonzero(np.diff(large)) + 1
+    for change, end in zip(changes, [*changes[1:], len(y)]):
+        begins = (change - 0.5) * step_s / tau_s
+        now *= np.exp(began - begins)
+        held_then = 0.5 * (held[change - 1] + held[change])
+        factor = RANGE_RATIO if large[change] else 1.0 / RANGE_RATIO
+        now, began = factor * (now + held_then) - held_then, begins
+        error[change:end] = now * np.exp(began - after[change:end])
+    return y + error
 
 
 def at_times(y: np.ndarray, stretch: Stretch, time_s: np.ndarray) -> np.ndarray:
