@@ -17,12 +17,15 @@ import numpy as np
 
 from case import FULL_SCALE_A, JUST_VISIBLE, SIGMA_A, Made, noise, rms, rounded, write_case
 from drives import FINE, RECORDINGS, Stretch, stream, stretches
+from sensing import EDGES, edge_names
 
 A_PER_V = 100.0
 LEAD_S = 2.0
 MOST_ROWS = 3000
 """Rows of a stretch: 300 s at 10 Hz, some seconds of ngspice."""
 TIME_LIMIT_S = 120
+TRIES = 12
+"""Simulations in search of a strength."""
 DRIVES = ("us06", "hwfet")
 THERMAL_V = 1.380649e-23 * 300.15 / 1.602176634e-19
 """kT/q at ngspice's 27 °C, in V."""
@@ -215,6 +218,25 @@ def ferrite() -> tuple[np.ndarray, np.ndarray]:
 
 
 def core_hysteresis(size: float) -> Circuit:
+    """Voltage behind a capacitor, clamped by diodes of both directions: follows the current within limits, then stops.
+
+    What is left when the current rests leaks away with the logarithm of time, as a core's after-effect does.
+    """
+    weight = 0.01 * size
+    emission, typical_a = 0.3, 0.5e-6
+    lines, total = [], []
+    for index, limit_v in enumerate([0.15, 0.25, 0.4]):
+        saturation_a = typical_a * np.exp(-limit_v / (emission * THERMAL_V))
+        lines.append(f"""C{index} in n{index} 1u
+Dup{index} n{index} 0 clamp{index}
+Ddown{index} 0 n{index} clamp{index}
+.model clamp{index} D(IS={saturation_a:.6g} N={emission})""")
+        total.append(f"v(n{index})")
+    lines.append(f"Bsum out 0 V='v(in)-{weight:.9g}*({'+'.join(total)})'")
+    return Circuit("\n".join(lines), A_PER_V, {})
+
+
+def core_preisach(size: float) -> Circuit:
     """Hysteresis blocks (Preisach), each less its middle line: no error at full range, memory at zero.
 
     Each stands there twice, once with input and output turned round: so together they begin demagnetised.
@@ -254,9 +276,12 @@ Bout out 0 V='(v(area)-2*v(far))/{window_s:.9g}'
 """, A_PER_V, {"moving-average": {"window_s": window_s}}, step_s=max(0.25 * window_s, 0.002))
 
 
-def sampled_window(size: float) -> Circuit:
-    """A gated integrator: switches let the current in for a part of each period, hand the charge on, and reset."""
-    period_s, duty = 0.37 + 0.002 * size, 0.45
+def sampled_window(_: float) -> Circuit:
+    """A gated integrator: switches let the current in for a part of each period, hand the charge on, and reset.
+
+    Of one size: with a period of less than some rows nobody could see it.
+    """
+    period_s, duty = 0.37, 0.45
     open_s, short_s = duty * period_s, 0.01 * period_s
     edge_s = 1e-3 * period_s
     first_s = LEAD_S % period_s
@@ -389,11 +414,8 @@ Rload out 0 10k
 
 
 OPAMP_DEVICES = "bipolar transistors (Gummel–Poon), resistors, capacitors"
-NAMES_OF_EDGES = ["lag", "moving-average", "delay"]
-SHORT = "on rows of 0.1 s straight lines between rows make a short lag, average and delay the same"
-
 KINDS: dict[str, Kind] = {
-    "lag": Kind(lag, OPAMP_DEVICES, [NAMES_OF_EDGES], [], f"R·C in the feedback; {SHORT}"),
+    "lag": Kind(lag, OPAMP_DEVICES, [["lag"]], [], "R·C in the feedback"),
     "gain": Kind(gain, OPAMP_DEVICES, [["gain"]], [], "a resistor of the amplifier"),
     "offset": Kind(offset, OPAMP_DEVICES, [["offset"]], [], "areas of the input transistors: kT/q·ln"),
     "clipping": Kind(clipping, OPAMP_DEVICES, [["clipping", "core-saturation"]], [],
@@ -412,11 +434,17 @@ KINDS: dict[str, Kind] = {
     "core-saturation": Kind(core_saturation, "XSPICE lcouple and core, B(H) of a measured ferrite",
                             [["core-saturation", "clipping"]], ["gain"],
                             "the ferrite saturates abruptly, so that a rail is as right; below, its permeability is not constant"),
-    "core-hysteresis": Kind(core_hysteresis, "XSPICE hyst", [["core-hysteresis"]], [], "memory of the sign of what flowed"),
-    "delay": Kind(delay, "transmission line (T)", [NAMES_OF_EDGES], [], SHORT),
-    "moving-average": Kind(moving_average, "capacitor, transmission line (T)", [NAMES_OF_EDGES], [], SHORT),
+    "core-hysteresis": Kind(core_hysteresis, "capacitors, diodes", [["core-hysteresis"]], ["lag", "moving-average", "delay"],
+                            "memory that follows each turn of the current, as a core with a gap has it; a diode's clamp rises with "
+                            "the logarithm of the rate, which is a little lag"),
+    "core-preisach": Kind(core_preisach, "XSPICE hyst", [["core-hysteresis"]], [],
+                          "memory of the sign of what flowed, as a core without a gap has it; the table's law is another"),
+    "delay": Kind(delay, "transmission line (T)", [["delay"]], [], "delay of the line"),
+    "moving-average": Kind(moving_average, "capacitor, transmission line (T)", [["moving-average"]], [],
+                           "charge within the delay of the line"),
     "sampled-window": Kind(sampled_window, "switches, capacitors", [["sampled-window"]], [], "a gated integrator"),
-    "range-mismatch": Kind(range_mismatch, "switches, resistors", [["range-mismatch"]], [], "one divider of two", ("range_high",)),
+    "range-mismatch": Kind(range_mismatch, "switches, resistors", [["range-mismatch"]], [], "one divider of two",
+                           ("range_high",)),
     "range-handover": Kind(range_handover, "switches, R, C, controlled sources", [["range-handover"]], [],
                            "the low-pass keeps the old range's scale", ("range_high",)),
     "stray-field": Kind(stray_field, "XSPICE lcouple, reluctances", [["stray-field"]], [], "the neighbour's flux", ("aux_a",)),
@@ -484,15 +512,21 @@ quit
 def sized(kind: Kind, strength: float, stretch: Stretch) -> tuple[Circuit, np.ndarray]:
     """The circuit that moves the reading by 0.3·strength·SIGMA_A rms (within 10 %, if it can), and its reading in A."""
     target = JUST_VISIBLE * strength * SIGMA_A
-    size, last = strength, 0.0
-    for _ in range(8):
+    size, small, large = strength, 0.0, np.inf
+    last = 0.0
+    for _ in range(TRIES):
         circuit = kind.circuit(size)
         reading_a = simulate(circuit, kind, stretch)
-        ratio = target / rms(reading_a - stretch.current_a)
-        if abs(ratio - 1.0) < 0.1 or abs(ratio / last - 1.0 if last else 1.0) < 0.05:
+        moved = rms(reading_a - stretch.current_a)
+        # A circuit that always does more cannot be made weaker.
+        if abs(moved / target - 1.0) < 0.1 or target < moved == last:
             break
-        last = ratio
-        size *= float(np.clip(ratio, 0.2, 5.0))
+        last = moved
+        small, large = (size, large) if moved < target else (small, size)
+        if small > 0.0 and np.isfinite(large):
+            size = float(np.sqrt(small * large))
+        else:
+            size *= float(np.clip(target / moved, 0.25, 4.0))
     return circuit, reading_a
 
 
@@ -512,14 +546,18 @@ def make(case: dict, out: pathlib.Path) -> None:
         noise_a = stated.sample(stream(case, purpose), stretch.rows, stretch.step_s)
         return Made(stretch, rounded(quiet_a + noise_a, stated.step_a), quiet_a)
 
+    required, classes, why = kind.required, [ids for ids in kind.required if len(ids) > 1], kind.why
+    if names[0] in EDGES:
+        same, classes, reason = edge_names(fitted, names[0], circuit.values[names[0]], stated)
+        required, why = [same], f"{why}; {reason}"
     truth = {
         "kind": "b",
         "maker": f"ngspice: {kind.devices}; noise added behind it",
         "effects": [{"id": name, "parameters": circuit.values.get(name)} for name in circuit.values or names],
-        "required": kind.required,
+        "required": required,
         "allowed": kind.allowed,
-        "class_ids": [ids for ids in kind.required if len(ids) > 1],
-        "why": kind.why,
+        "class_ids": classes,
+        "why": why,
         "where": None,
     }
     write_case(out, made(fitted, fitted_a, "noise"), made(holdout, simulate(circuit, kind, holdout), "noise held out"), stated, truth)

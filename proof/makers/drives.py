@@ -18,8 +18,8 @@ FINE = 20
 """Steps of the fine grid in one row: what works between rows is calculated there."""
 HIGH_A, LOW_A = 53.33, 51.0
 """The large range begins above HIGH_A and ends below LOW_A, by abs(i)."""
-LONGEST_REST_S = 120.0
-"""Longer rests of the pulse test are cut to this."""
+LONGEST_STEADY_S = 120.0
+"""Longer rests and discharges of the pulse test are cut to this."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,20 +94,22 @@ def _even(t_s: np.ndarray, value: np.ndarray, step_s: float) -> np.ndarray:
     return np.interp(np.arange(0.0, t_s[-1], step_s), t_s, value)
 
 
-def _panasonic(file: str) -> tuple[float, np.ndarray]:
+def _panasonic(file: str, step_s: float = 0.1, from_s: float = 0.0) -> tuple[float, np.ndarray]:
     # × 19: the truck's pack that the cell stands for, ±400 A.
     t_s, current_a = _columns(f"panasonic-18650pf/{file}", "t_s", "i_ref_a")
-    return 0.1, 19.0 * _even(t_s, current_a, 0.1)
+    rows = t_s >= from_s
+    return step_s, 19.0 * _even(t_s[rows] - from_s, current_a[rows], step_s)
 
 
 def _leaf() -> tuple[float, np.ndarray]:
-    # × 10: ±300 A. The edges of the pulses are recorded once a second, so that is the grid.
+    # × 10: ±300 A. The edges of the pulses are recorded once a second, so that is the grid. From the first pulse on.
     t_s, current_a = _columns("leaf-cell/hppc-25c.csv", "t_s", "i_ref_a")
     even = 10.0 * _even(t_s, current_a, 1.0)
-    rest = np.zeros(len(even), dtype=int)
+    even = even[np.argmax(even > 250.0) - 60 :]
+    steady = np.zeros(len(even), dtype=int)
     for row in range(1, len(even)):
-        rest[row] = rest[row - 1] + 1 if abs(even[row]) < 1.0 else 0
-    return 1.0, even[rest <= LONGEST_REST_S]
+        steady[row] = steady[row - 1] + 1 if abs(even[row] - even[row - 1]) < 1.0 else 0
+    return 1.0, even[steady <= LONGEST_STEADY_S]
 
 
 def _gpu() -> tuple[float, np.ndarray]:
@@ -125,6 +127,8 @@ def _square() -> tuple[float, np.ndarray]:
 DRIVES = {
     "us06": lambda: _panasonic("25c-us06.csv"),
     "hwfet": lambda: _panasonic("25c-hwfet.csv"),
+    # Ten rows for each of the recording, from a lively minute on: what works within 0.1 s shows.
+    "us06-fast": lambda: _panasonic("25c-us06.csv", 0.01, 280.0),
     "hppc": _leaf,
     "gpu": _gpu,
     "square": _square,
