@@ -66,6 +66,7 @@ class Design:
     resistance_ohm: float
     initial_soc: float
     resistance_uncertainty: float = 0.0
+    initial_soc_uncertainty: float = 0.0
     arrhenius_k: float = 0.0
     polarisation: Ladder = ()
     diffusion: tuple[float, float] | None = None
@@ -99,7 +100,8 @@ class Design:
         lines = [
             "schema = 1", f'name = "{self.name}"', "", "[battery]", f"capacity_ah = {self.capacity_ah:.8g}",
             f"ohmic_resistance_ohm = {self.resistance_ohm:.8g}", f"resistance_uncertainty = {self.resistance_uncertainty:g}",
-            f"initial_soc = {self.initial_soc:g}", f"noise_v = {noise_v:.6g}", f"ocv = [{table}]",
+            f"initial_soc = {self.initial_soc:.8g}",
+            f"initial_soc_uncertainty = {self.initial_soc_uncertainty:g}", f"noise_v = {noise_v:.6g}", f"ocv = [{table}]",
         ]
         if self.arrhenius_k:
             lines += ["", "[effects.resistance-temperature]", f"b_k = {self.arrhenius_k:.6g}"]
@@ -162,3 +164,17 @@ def write_case(out: pathlib.Path, case: dict, fitted: Made, holdout: Made, model
 def visible_v(strength: float) -> float:
     """Change of the voltage in V, rms, of a strength."""
     return strength * JUST_VISIBLE * SIGMA_V
+
+
+def scaled(change_v, first: float, wanted_v: float, what: str) -> float:
+    """The size at which `change_v(size)` is wanted_v, by secants of its logarithm; nearly a power law."""
+    sizes, changes = [first], [change_v(first)]
+    slope = 1.0
+    for _ in range(6):
+        if abs(changes[-1] / wanted_v - 1.0) < 0.01:
+            return sizes[-1]
+        if len(sizes) > 1:
+            slope = np.log(changes[-1] / changes[-2]) / np.log(sizes[-1] / sizes[-2])
+        sizes.append(sizes[-1] * (wanted_v / changes[-1]) ** (1.0 / np.clip(slope, 0.2, 3.0)))
+        changes.append(change_v(sizes[-1]))
+    raise RuntimeError(f"{what}: {1e3 * wanted_v:.3g} mV is out of its reach, last {1e3 * changes[-1]:.3g} mV at {sizes[-1]:.3g}")
