@@ -207,6 +207,10 @@ def outside(volts: np.ndarray, current_a: np.ndarray, soc: np.ndarray, hidden: d
     if "contact-resistance-rise" in hidden:
         hours = np.arange(len(volts)) * STEP_S / 3600.0
         volts = volts - hidden["contact-resistance-rise"]["ohm_per_h"] * hours * current_a
+    if "loose-contact" in hidden:
+        law = hidden["loose-contact"]
+        open_now = np.mod(np.arange(len(volts)) * STEP_S - law["from_s"], law["every_s"]) < law["for_s"]
+        volts = volts - law["ohm"] * open_now * current_a
     if "ocv-step" in hidden:
         law = hidden["ocv-step"]
         volts = volts + 0.5 * law["step_v"] * np.tanh((soc - law["soc"]) / law["width_soc"])
@@ -215,7 +219,7 @@ def outside(volts: np.ndarray, current_a: np.ndarray, soc: np.ndarray, hidden: d
     return volts
 
 
-OUTSIDE = ("voltage-gain", "contact-resistance-rise", "ocv-step", "charge-resistance")
+OUTSIDE = ("voltage-gain", "contact-resistance-rise", "loose-contact", "ocv-step", "charge-resistance")
 
 
 def between(random: np.random.Generator, low: float, high: float) -> float:
@@ -243,6 +247,7 @@ PARAMETERS = {
     "entropic": lambda size, draw, sign: {"v_per_k": sign * size},
     "voltage-gain": lambda size, draw, sign: {"error": sign * size},
     "contact-resistance-rise": lambda size, draw, sign: {"ohm_per_h": size},
+    "loose-contact": lambda size, draw, sign: {"ohm": size, "from_s": draw["loose_s"], "every_s": 1000.0, "for_s": 170.0},
     "ocv-step": lambda size, draw, sign: {"step_v": sign * size, "soc": draw["step_soc"], "width_soc": 0.004},
     "charge-resistance": lambda size, draw, sign: {"ohm": sign * size},
 }
@@ -250,7 +255,8 @@ SIGNED = ("capacity", "offset", "entropic", "voltage-gain", "ocv-step", "charge-
 FIRST_SIZE = {
     "capacity": 0.01, "coulombic-efficiency": 0.01, "parasitic-load": 0.02, "offset": 0.02, "polarisation": 1e-3, "diffusion": 2e-3,
     "ocv-hysteresis": 2e-3, "resistance-temperature": 0.3, "resistance-soc": 0.1, "cell-self-heating": 1.0, "entropic": 1e-4,
-    "voltage-gain": 0.01, "contact-resistance-rise": 1e-3, "ocv-step": 1e-3, "charge-resistance": 1e-3,
+    "voltage-gain": 0.01, "contact-resistance-rise": 1e-3, "loose-contact": 1e-3,
+    "ocv-step": 1e-3, "charge-resistance": 1e-3,
 }
 
 
@@ -300,7 +306,7 @@ class Conceal:
         self.draw = {
             "tau1_s": between(self.random, 5.0, 60.0), "tau_s": between(self.random, 150.0, 800.0),
             "gamma": between(self.random, 30.0, 200.0), "heat_tau_s": between(self.random, 200.0, 900.0),
-            "step_soc": float(soc[0] + self.random.uniform(0.3, 0.7) * (soc[-1] - soc[0])),
+            "loose_s": float(self.random.uniform(200.0, 800.0)), "step_soc": float(soc[0] + self.random.uniform(0.3, 0.7) * (soc[-1] - soc[0])),
         }
         self.plain = voltage(drive, cell, {})
 
@@ -357,16 +363,19 @@ def recorded(case: dict, drive: Drive, cell: Design, stated: Design, hidden: dic
 
 def truth(hidden: dict[str, Values]) -> dict:
     """What is concealed."""
-    classes, why = [], None
+    classes, why, allowed = [], None, []
     if "offset" in hidden:
         classes.append(["offset", "parasitic-load"])
         why = "The current has one instrument: a zero error and a consumer that it does not see are the same."
+    if "contact-resistance-rise" in hidden:
+        allowed.append("resistance-soc")
+        why = "In a drive without a charge time and state of charge go together: rising with the one is falling with the other."
     names = {effect: ["parasitic-load", "offset"] if effect == "offset" else [effect] for effect in hidden}
     return {
         "kind": "c", "maker": f"own equations, scipy {scipy.__version__} solve_ivp LSODA",
         "effects": [{"id": effect, "parameters": values} for effect, values in hidden.items()],
         "required": [names[effect] for effect in hidden if effect not in OUTSIDE],
-        "allowed": [], "class_ids": classes, "why": why, "where": where(hidden),
+        "allowed": allowed, "class_ids": classes, "why": why, "where": where(hidden),
     }
 
 
