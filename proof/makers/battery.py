@@ -6,7 +6,7 @@ written anew here. Each drive begins after a long rest: everything at rest, no h
 
 Options of a case: `temperature` "swing" (default) or "constant"; `relaxation` true: the cell has relaxation that the design
 knows; `uncertain` true: initial state of charge and resistance are off, by what the model file states; `masked` true: the sign
-of each further effect is the one that hides those before it.
+of an effect that can have either is the one that hides the others.
 """
 
 import dataclasses
@@ -343,9 +343,11 @@ def make(case: dict, out: pathlib.Path) -> None:
     hidden: dict[str, Values] = {}
     if case["effects"]:
         find, before = Conceal(case, cell, drives[0]), None
-        for effect in case["effects"]:
+        # What can have either sign comes last, to hide the others.
+        masked = bool(case["options"].get("masked"))
+        for effect in sorted(case["effects"], key=lambda effect: masked and effect["id"] in SIGNED):
             hidden[effect["id"]], change = find.parameters(effect["id"], effect["strength"], before)
-            if case["options"].get("masked"):
+            if masked:
                 before = change if before is None else before + change
     made = [recorded(case, drive, cell, stated, hidden, index) for index, drive in enumerate(drives)]
     write_case(out, case, *made, stated.lines(SIGMA_V), truth(hidden))

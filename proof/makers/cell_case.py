@@ -18,6 +18,8 @@ WHITE_BESIDE = 0.3
 STEP_S = 0.5
 """Time between rows; the current goes in straight lines between them."""
 REFERENCE_C, ZERO_CELSIUS_K = 25.0, 273.15
+TRIES = 8
+"""So often the size of an effect is tried."""
 OTHER_DRIVE = {"us06": "hwfet", "hwfet": "us06"}
 
 Ladder = tuple[tuple[float, float], ...]
@@ -166,15 +168,14 @@ def visible_v(strength: float) -> float:
     return strength * JUST_VISIBLE * SIGMA_V
 
 
-def scaled(change_v, first: float, wanted_v: float, what: str) -> float:
+def scaled(change_v, first: float, wanted_v: float, what: str, tolerance: float = 0.01) -> float:
     """The size at which `change_v(size)` is wanted_v, by secants of its logarithm; nearly a power law."""
-    sizes, changes = [first], [change_v(first)]
-    slope = 1.0
-    for _ in range(6):
-        if abs(changes[-1] / wanted_v - 1.0) < 0.01:
-            return sizes[-1]
+    sizes, changes, slope = [first], [change_v(first)], 1.0
+    while len(sizes) < TRIES and changes[-1] > 0.0 and abs(changes[-1] / wanted_v - 1.0) > tolerance:
         if len(sizes) > 1:
-            slope = np.log(changes[-1] / changes[-2]) / np.log(sizes[-1] / sizes[-2])
-        sizes.append(sizes[-1] * (wanted_v / changes[-1]) ** (1.0 / np.clip(slope, 0.2, 3.0)))
+            slope = np.clip(np.log(changes[-1] / changes[-2]) / np.log(sizes[-1] / sizes[-2]), 0.2, 3.0)
+        sizes.append(float(sizes[-1] * (wanted_v / changes[-1]) ** (1.0 / slope)))
         changes.append(change_v(sizes[-1]))
+    if abs(changes[-1] / wanted_v - 1.0) <= tolerance:
+        return sizes[-1]
     raise RuntimeError(f"{what}: {1e3 * wanted_v:.3g} mV is out of its reach, last {1e3 * changes[-1]:.3g} mV at {sizes[-1]:.3g}")

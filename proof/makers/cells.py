@@ -32,6 +32,8 @@ SWING_PERIOD_S = 2000.0
 TEMPERATURE_NOISE_K = 0.05
 HYSTERESIS_DECAY = 100.0
 """Of the one-state model: the state turns by 1 − 1/e within a fiftieth of the electrode's lithium."""
+SIZE_TOLERANCE = 0.05
+"""A strength is met to this: each try is a solution by PyBaMM."""
 SENSOR_NOISE_A = 0.02
 RESISTANCE_UNCERTAINTY = 0.05
 MODELS = {"spme": pybamm.lithium_ion.SPMe, "dfn": pybamm.lithium_ion.DFN}
@@ -284,7 +286,7 @@ class Conceal:
         def change_v(size: float) -> float:
             return rms(solved(with_physics(self.cell, effect, size), self.drive, self.rows)[0] - plain)
 
-        return scaled(change_v, FIRST_SIZE[effect], visible_v(strength), effect)
+        return scaled(change_v, FIRST_SIZE[effect], visible_v(strength), effect, SIZE_TOLERANCE)
 
     def recorded(self, effect: str, strength: float) -> float:
         """Size of an effect of the recording: load in A, lost share of charge, excess of the stated capacity (either sign)."""
