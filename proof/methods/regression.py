@@ -1,0 +1,228 @@
+"""Straight line, forward selection by BIC (independent or AR(1) errors), and all effects at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from dictionary import Entry, dictionary, nuisances
+from result import Fitted
+from series import Series
+
+Array = np.ndarray
+
+# Two-sided 1 % of the normal distribution.
+Z_1_PERCENT = 2.5758
+# No more effects than the library has rows for one view.
+MOST_ENTRIES = 20
+
+
+def straight_line(recording: Series) -> Fitted:
+    """Ordinary least squares of the reading on the simulation: zero and slope, each named if its t-test at 1 % says so."""
+    valid = recording.valid
+    columns = np.column_stack([np.ones(valid.sum()), recording.simulated[valid]])
+    target = recording.residual[valid]
+    coefficients, *_ = np.linalg.lstsq(columns, target, rcond=None)
+    left = target - columns @ coefficients
+    covariance = np.linalg.pinv(columns.T @ columns) * (left @ left) / max(len(target) - 2, 1)
+    t_values = np.abs(coefficients) / np.sqrt(np.diag(covariance))
+    zero, slope = (float(c) for c in coefficients)
+    named = [name for name, t in zip(("offset", "gain"), t_values) if t > Z_1_PERCENT]
+    parameters = {"offset": {"offset_a": zero}, "gain": {"gain": 1.0 + slope}}
+    note = "t-test at 1 %, independent errors"
+    if recording.kind == "battery":
+        named, parameters = [], {"zero_v": zero, "slope": 1.0 + slope}
+        note = "line through the voltage; no effect of the library is one, so none is named"
+    return Fitted(named, lambda series: zero + slope * series.simulated, parameters, note)
+
+
+@dataclass
+class Model:
+    """Entries taken, and what is needed to weigh another one."""
+
+    entries: list[Entry]
+    # Columns of the nuisances and the entries, before any transform.
+    columns: Array
+    phi: float
+    score: float
+
+
+class Stepwise:
+    """Forward selection with backward steps over the dictionary, by BIC."""
+
+    def __init__(self, recording: Series, ar1: bool) -> None:
+        self.recording = recording
+        self.ar1 = ar1
+        valid = recording.valid
+        self.target = recording.residual[valid]
+        self.first = first_rows(recording)
+        self.base = nuisances(recording)[valid]
+        self.entries = dictionary(recording)
+        self.pool = [unit(self.columns(entry)) for entry in self.entries]
+
+    def columns(self, entry: Entry) -> Array:
+        """Columns of an entry on the rows that were read."""
+        return entry.columns(self.recording)[self.recording.valid]
+
+    def run(self) -> Model:
+        """Adds the best entry, its value tuned, and drops what is no longer needed, while BIC falls."""
+        model = self.fit([], self.base)
+        for _ in range(2 * MOST_ENTRIES):
+            grown = self.grow(model)
+            if grown is None or grown.score >= model.score or len(grown.entries) > MOST_ENTRIES:
+                break
+            model = self.prune(grown)
+        return model
+
+    def grow(self, model: Model) -> Model | None:
+        """The model with the entry that lowers the sum of squares most for its number of parameters."""
+        best, chosen = 0.0, None
+        left, basis = self.left(model)
+        rows = len(left)
+        energy = float(left @ left)
+        for entry, columns in zip(self.entries, self.pool):
+            gain = gain_of(self.whiten(columns, model.phi), basis, left)
+            fall = -rows * np.log(max(1.0 - gain / energy, 1e-12)) - cost(entry, columns) * np.log(rows)
+            if fall > best:
+                best, chosen = fall, entry
+        if chosen is None:
+            return None
+        chosen = self.tune(chosen, model)
+        return self.fit([*model.entries, chosen], np.column_stack([model.columns, self.columns(chosen)]))
+
+    def tune(self, entry: Entry, model: Model) -> Entry:
+        """Moves the entry's value within its neighbours on the grid to the least sum of squares."""
+        if not entry.tuned:
+            return entry
+        left, basis = self.left(model)
+
+        def loss(value: float) -> float:
+            columns = self.whiten(unit(self.columns(entry.moved(value))), model.phi)
+            return -gain_of(columns, basis, left)
+
+        span = (entry.low, entry.high)
+        found = minimize_scalar(loss, bounds=span, method="bounded", options={"xatol": 1e-3 * (span[1] - span[0])})
+        return entry.moved(float(found.x)) if found.fun < loss(entry.value) else entry
+
+    def prune(self, model: Model) -> Model:
+        """Drops the entry without which BIC is lowest, while that helps."""
+        while len(model.entries) > 1:
+            shorter = [self.without(model, place) for place in range(len(model.entries))]
+            best = min(shorter, key=lambda m: m.score)
+            if best.score >= model.score:
+                break
+            model = best
+        return model
+
+    def without(self, model: Model, place: int) -> Model:
+        """The model without one entry."""
+        entries = model.entries[:place] + model.entries[place + 1 :]
+        return self.fit(entries, np.column_stack([self.base, *(self.columns(e) for e in entries)]))
+
+    def fit(self, entries: list[Entry], columns: Array) -> Model:
+        """Least squares (AR(1): Cochrane–Orcutt, Prais–Winsten's first row) and BIC."""
+        phi, starts = 0.0, int(self.first.sum())
+        for _ in range(8 if self.ar1 else 0):
+            coefficients = self.solve(columns, phi)
+            before, phi = phi, self.correlation(self.target - columns @ coefficients)
+            if abs(phi - before) < 1e-4:
+                break
+        left = self.whiten(self.target, phi) - self.whiten(columns, phi) @ self.solve(columns, phi)
+        rows = len(left)
+        parameters = self.base.shape[1] + sum(cost(e, e.coefficients) for e in entries) + self.ar1
+        likelihood = rows * np.log(max(left @ left, 1e-300) / rows) - starts * np.log(1.0 - phi * phi)
+        return Model(entries, columns, phi, float(likelihood + parameters * np.log(rows)))
+
+    def solve(self, columns: Array, phi: float) -> Array:
+        """Coefficients by least squares on standardised columns."""
+        size = np.linalg.norm(columns, axis=0)
+        size[size == 0] = 1.0
+        whitened = self.whiten(columns / size, phi)
+        return np.linalg.lstsq(whitened, self.whiten(self.target, phi), rcond=1e-10)[0] / size
+
+    def correlation(self, left: Array) -> float:
+        """Correlation of neighbouring errors within segments."""
+        inner = ~self.first[1:]
+        product = float(np.sum((left[1:] * left[:-1])[inner]))
+        return float(np.clip(product / max(float(np.sum(left[:-1][inner] ** 2)), 1e-300), -0.999, 0.9999))
+
+    def whiten(self, values: Array, phi: float) -> Array:
+        """v[k] − φ·v[k−1]; the first row of a segment times √(1 − φ²)."""
+        if phi == 0.0:
+            return values
+        out = values.copy()
+        out[1:] -= phi * values[:-1]
+        out[self.first] = np.sqrt(1.0 - phi * phi) * values[self.first]
+        return out
+
+    def left(self, model: Model) -> tuple[Array, Array]:
+        """What the model leaves, and an orthonormal basis of its columns, both whitened."""
+        target = self.whiten(self.target, model.phi)
+        if model.columns.shape[1] == 0:
+            return target, np.zeros((len(target), 0))
+        basis = orthonormal(self.whiten(model.columns, model.phi))
+        return target - basis @ (basis.T @ target), basis
+
+
+def first_rows(recording: Series) -> Array:
+    """Marks the first row read of each segment, over the rows read."""
+    segment = np.zeros(len(recording.x), int)
+    for number, part in enumerate(recording.segments):
+        segment[part] = number
+    read = segment[recording.valid]
+    return np.concatenate([[True], np.diff(read) != 0])
+
+
+def unit(columns: Array) -> Array:
+    """Columns over their length."""
+    size = np.linalg.norm(columns, axis=0)
+    return columns / np.where(size > 0, size, 1.0)
+
+
+def orthonormal(columns: Array) -> Array:
+    """An orthonormal basis of the columns; dependent ones fall away."""
+    left, sizes, _ = np.linalg.svd(unit(columns), full_matrices=False)
+    return left[:, sizes > 1e-7]
+
+
+def cost(entry: Entry, columns: object) -> int:
+    """Parameters of an entry: its coefficients and, if it has one, its value on the grid."""
+    return len(entry.coefficients) + entry.tuned
+
+
+def gain_of(columns: Array, basis: Array, left: Array) -> float:
+    """By how much the columns lower the sum of squares beyond the basis."""
+    rest = columns - basis @ (basis.T @ columns)
+    # Nothing new within rounding: the column is one of the model's.
+    if rest.shape[1] == 1:
+        size = float(rest[:, 0] @ rest[:, 0])
+        return float(rest[:, 0] @ left) ** 2 / size if size > 1e-9 * float(columns[:, 0] @ columns[:, 0]) else 0.0
+    projected = orthonormal(rest).T @ left
+    return float(projected @ projected)
+
+
+def stepwise(recording: Series, ar1: bool) -> Fitted:
+    """Names the effects of the entries that BIC keeps."""
+    search = Stepwise(recording, ar1)
+    model = search.run()
+    coefficients = search.solve(model.columns, model.phi)
+    note = f"{len(search.entries)} entries in the dictionary, {len(model.entries)} taken" + (f", phi {model.phi:.4f}" if ar1 else "")
+    return from_entries(search.base.shape[1], model.entries, coefficients, note)
+
+
+def from_entries(base: int, entries: list[Entry], coefficients: Array, note: str) -> Fitted:
+    """A linear model of nuisances and entries."""
+    parameters: dict[str, list[dict[str, float]]] = {}
+    place = base
+    for entry in entries:
+        width = len(entry.coefficients)
+        parameters.setdefault(entry.id, []).append(entry.described(coefficients[place : place + width]))
+        place += width
+
+    def predict(series: Series) -> Array:
+        columns = np.column_stack([nuisances(series), *(entry.columns(series) for entry in entries)])
+        return columns @ coefficients
+
+    return Fitted(sorted({entry.id for entry in entries}), predict, parameters, note)
