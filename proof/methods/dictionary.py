@@ -347,8 +347,11 @@ def battery_entries(recording: Series) -> list[Entry]:
             *spread("resistance-temperature", arrhenius, "b_k", np.array([1000.0, 2000.0, 4000.0])),
             Entry("entropic", lambda s, _: s.battery.cells * warmth(s), coefficients=(("v_per_k", 0.0),)),
         ]
-    warm = times(max(10 * step, 10.0), max(span / 2, 100.0), 3.0)
-    return out + spread("cell-self-heating", cell_heating, "tau_s", warm)
+    else:
+        # Where the temperature is recorded, it holds the warming.
+        warm = times(max(10 * step, 10.0), max(span / 2, 100.0), 3.0)
+        out += spread("cell-self-heating", cell_heating, "tau_s", warm)
+    return out
 
 
 def ohms(series: Series) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.linalg import solve_banded
 from scipy.signal import lfilter
 
 Array = np.ndarray
@@ -31,12 +32,14 @@ def low_pass(t_s: Array, x: Array, tau_s: float, start: float | None = None) -> 
     if np.ptp(step) < 1e-3 * step[0]:
         push = now[0] * x[1:] + before[0] * x[:-1]
         return np.concatenate([[state], lfilter([1.0], [1.0, -keep[0]], push, zi=[keep[0] * state])[0]])
-    push = now * x[1:] + before * x[:-1]
-    out = [state]
-    for factor, drive in zip(keep.tolist(), push.tolist()):
-        state = factor * state + drive
-        out.append(state)
-    return np.asarray(out)
+    return recursion(keep, now * x[1:] + before * x[:-1], state)
+
+
+def recursion(keep: Array, push: Array, state: float) -> Array:
+    """y[k] = keep[k]·y[k−1] + push[k] from `state`, as one system of two diagonals."""
+    bands = np.ones((2, len(push) + 1))
+    bands[1, :-1] = -keep
+    return solve_banded((1, 0), bands, np.concatenate([[state], push]), check_finite=False)
 
 
 def boxcar(t_s: Array, x: Array, window_s: float) -> Array:
@@ -111,11 +114,7 @@ def direction_memory(t_s: Array, current_a: Array, gamma: float, capacity_ah: fl
     """State of the OCV hysteresis (Plett 2004), −1 … 1, 0 at first: dh/dt = −γ·abs(i)/(3600·Q)·(h + sgn i)."""
     mean = 0.5 * (current_a[1:] + current_a[:-1])
     keep = np.exp(-gamma * np.abs(mean) * np.diff(t_s) / (3600.0 * capacity_ah))
-    state, out = 0.0, [0.0]
-    for factor, sign in zip(keep.tolist(), np.sign(mean).tolist()):
-        state = factor * (state + sign) - sign if sign else state
-        out.append(state)
-    return np.asarray(out[: len(current_a)])
+    return recursion(keep, (keep - 1.0) * np.sign(mean), 0.0)
 
 
 def diffusion(t_s: Array, current_a: Array, tau_s: float) -> Array:

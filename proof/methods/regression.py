@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import lstsq, qr
 from scipy.optimize import minimize_scalar
 
 from dictionary import Entry, dictionary, nuisances
@@ -43,10 +44,17 @@ class Model:
     """Entries taken, and what is needed to weigh another one."""
 
     entries: list[Entry]
-    # Columns of the nuisances and the entries, before any transform.
-    columns: Array
+    # Columns of the nuisances, then of each entry, before any transform.
+    blocks: list[Array]
     phi: float
     score: float
+    # What it leaves and the basis of its columns, once asked for.
+    rest: tuple[Array, Array] | None = None
+
+    @property
+    def columns(self) -> Array:
+        """All columns side by side."""
+        return np.column_stack(self.blocks)
 
 
 class Stepwise:
@@ -68,7 +76,7 @@ class Stepwise:
 
     def run(self) -> Model:
         """Adds the best entry, its value tuned, and drops what is no longer needed, while BIC falls."""
-        model = self.fit([], self.base)
+        model = self.fit([], [self.base])
         for _ in range(2 * MOST_ENTRIES):
             grown = self.grow(model)
             if grown is None or grown.score >= model.score or len(grown.entries) > MOST_ENTRIES:
@@ -84,13 +92,13 @@ class Stepwise:
         energy = float(left @ left)
         for entry, columns in zip(self.entries, self.pool):
             gain = gain_of(self.whiten(columns, model.phi), basis, left)
-            fall = -rows * np.log(max(1.0 - gain / energy, 1e-12)) - cost(entry, columns) * np.log(rows)
+            fall = -rows * np.log(max(1.0 - gain / energy, 1e-12)) - cost(entry) * np.log(rows)
             if fall > best:
                 best, chosen = fall, entry
         if chosen is None:
             return None
         chosen = self.tune(chosen, model)
-        return self.fit([*model.entries, chosen], np.column_stack([model.columns, self.columns(chosen)]))
+        return self.fit([*model.entries, chosen], [*model.blocks, self.columns(chosen)], model.phi)
 
     def tune(self, entry: Entry, model: Model) -> Entry:
         """Moves the entry's value within its neighbours on the grid to the least sum of squares."""
@@ -109,38 +117,54 @@ class Stepwise:
     def prune(self, model: Model) -> Model:
         """Drops the entry without which BIC is lowest, while that helps."""
         while len(model.entries) > 1:
-            shorter = [self.without(model, place) for place in range(len(model.entries))]
-            best = min(shorter, key=lambda m: m.score)
-            if best.score >= model.score:
+            place = self.idlest(model)
+            entries = model.entries[:place] + model.entries[place + 1 :]
+            shorter = self.fit(entries, model.blocks[: place + 1] + model.blocks[place + 2 :], model.phi)
+            if shorter.score >= model.score:
                 break
-            model = best
+            model = shorter
         return model
 
-    def without(self, model: Model, place: int) -> Model:
-        """The model without one entry."""
-        entries = model.entries[:place] + model.entries[place + 1 :]
-        return self.fit(entries, np.column_stack([self.base, *(self.columns(e) for e in entries)]))
+    def idlest(self, model: Model) -> int:
+        """The entry whose loss raises BIC least, at the model's correlation of errors."""
+        columns = self.whiten(unit(model.columns), model.phi)
+        inverse = np.linalg.pinv(columns.T @ columns)
+        coefficients = inverse @ (columns.T @ self.whiten(self.target, model.phi))
+        rises, place = [], self.base.shape[1]
+        for entry, block in zip(model.entries, model.blocks[1:]):
+            own = slice(place, place + block.shape[1])
+            place = own.stop
+            loss = coefficients[own] @ np.linalg.pinv(inverse[own, own]) @ coefficients[own]
+            rises.append(loss / self.variance(model) - cost(entry) * np.log(len(self.target)))
+        return int(np.argmin(rises))
 
-    def fit(self, entries: list[Entry], columns: Array) -> Model:
+    def variance(self, model: Model) -> float:
+        """Mean square of what the model leaves, whitened."""
+        left, _ = self.left(model)
+        return float(left @ left) / len(left)
+
+    def fit(self, entries: list[Entry], blocks: list[Array], phi: float = 0.0) -> Model:
         """Least squares (AR(1): Cochrane–Orcutt, Prais–Winsten's first row) and BIC."""
-        phi, starts = 0.0, int(self.first.sum())
+        columns = np.column_stack(blocks)
         for _ in range(8 if self.ar1 else 0):
-            coefficients = self.solve(columns, phi)
-            before, phi = phi, self.correlation(self.target - columns @ coefficients)
+            left = self.target - columns @ self.solve(columns, phi)
+            before, phi = phi, self.correlation(left)
             if abs(phi - before) < 1e-4:
                 break
-        left = self.whiten(self.target, phi) - self.whiten(columns, phi) @ self.solve(columns, phi)
-        rows = len(left)
-        parameters = self.base.shape[1] + sum(cost(e, e.coefficients) for e in entries) + self.ar1
+        left = self.whiten(self.target - columns @ self.solve(columns, phi), phi)
+        rows, starts = len(left), int(self.first.sum())
+        parameters = self.base.shape[1] + sum(cost(entry) for entry in entries) + self.ar1
         likelihood = rows * np.log(max(left @ left, 1e-300) / rows) - starts * np.log(1.0 - phi * phi)
-        return Model(entries, columns, phi, float(likelihood + parameters * np.log(rows)))
+        return Model(entries, blocks, phi, float(likelihood + parameters * np.log(rows)))
 
     def solve(self, columns: Array, phi: float) -> Array:
         """Coefficients by least squares on standardised columns."""
+        if columns.shape[1] == 0:
+            return np.zeros(0)
         size = np.linalg.norm(columns, axis=0)
         size[size == 0] = 1.0
         whitened = self.whiten(columns / size, phi)
-        return np.linalg.lstsq(whitened, self.whiten(self.target, phi), rcond=1e-10)[0] / size
+        return lstsq(whitened, self.whiten(self.target, phi), cond=1e-10, lapack_driver="gelsy", check_finite=False)[0] / size
 
     def correlation(self, left: Array) -> float:
         """Correlation of neighbouring errors within segments."""
@@ -159,11 +183,11 @@ class Stepwise:
 
     def left(self, model: Model) -> tuple[Array, Array]:
         """What the model leaves, and an orthonormal basis of its columns, both whitened."""
-        target = self.whiten(self.target, model.phi)
-        if model.columns.shape[1] == 0:
-            return target, np.zeros((len(target), 0))
-        basis = orthonormal(self.whiten(model.columns, model.phi))
-        return target - basis @ (basis.T @ target), basis
+        if model.rest is None:
+            target = self.whiten(self.target, model.phi)
+            basis = orthonormal(self.whiten(model.columns, model.phi))
+            model.rest = target - basis @ (basis.T @ target), basis
+        return model.rest
 
 
 def first_rows(recording: Series) -> Array:
@@ -183,11 +207,13 @@ def unit(columns: Array) -> Array:
 
 def orthonormal(columns: Array) -> Array:
     """An orthonormal basis of the columns; dependent ones fall away."""
-    left, sizes, _ = np.linalg.svd(unit(columns), full_matrices=False)
-    return left[:, sizes > 1e-7]
+    if columns.shape[1] == 0:
+        return columns
+    basis, triangle, _ = qr(unit(columns), mode="economic", pivoting=True, check_finite=False)
+    return basis[:, np.abs(np.diag(triangle)) > 1e-7]
 
 
-def cost(entry: Entry, columns: object) -> int:
+def cost(entry: Entry) -> int:
     """Parameters of an entry: its coefficients and, if it has one, its value on the grid."""
     return len(entry.coefficients) + entry.tuned
 
