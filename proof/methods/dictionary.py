@@ -22,6 +22,10 @@ RANGE_RATIO = 10.0
 # 2.5 V over the 2 V from zero to full scale: what the zero of a ratiometric sensor stands for, in full scales.
 HALF_SUPPLY_OVER_SPAN = 1.25
 ZERO_C_IN_K = 273.15
+# Arrhenius temperature of the resistance of usual lithium-ion cells, 1500 … 4000 K.
+USUAL_B_K = 2000.0
+# Entries of one effect in one model: one, but several RC branches and lines, and an upper and a lower rail.
+MOST_OF_ONE = {"polarisation": 3, "hum": 3, "clipping": 2}
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,8 @@ class Entry:
     high: float = 0.0
     # Names of the coefficients, and what turns them off.
     coefficients: tuple[tuple[str, float], ...] = (("coefficient", 0.0),)
+    # Physics allows a positive coefficient only.
+    positive: bool = False
 
     @property
     def tuned(self) -> bool:
@@ -165,14 +171,15 @@ def shape_entries(recording: Series) -> list[Entry]:
     """What depends on the size of the signal."""
     x = recording.x
     largest = float(np.abs(x).max())
-    out = spread("core-hysteresis", hysteresis, "coercivity_a", largest * np.geomspace(0.02, 0.4, 5))
-    out += spread("core-saturation", saturation, "knee_a", largest * np.array([0.3, 0.45, 0.6, 0.75, 0.88]))
+    out = spread("core-hysteresis", hysteresis, "coercivity_a", largest * np.geomspace(0.02, 0.4, 5), positive=True)
+    out += spread("core-saturation", saturation, "knee_a", largest * np.array([0.3, 0.45, 0.6, 0.75, 0.88]), positive=True)
     for sign, name in ((1.0, "high_a"), (-1.0, "low_a")):
         end = float((sign * x).max())
         if end > 0.05 * largest:
             build = clip_high if sign > 0 else clip_low
-            out += spread("clipping", build, name, end * np.array([0.4, 0.55, 0.7, 0.8, 0.88, 0.94, 0.98]))
-    out += spread("dead-band", dead_band, "threshold_a", largest * np.geomspace(0.003, 0.3, 8))
+            grid = end * np.array([0.4, 0.55, 0.7, 0.8, 0.88, 0.94, 0.98])
+            out += spread("clipping", build, name, grid, positive=True)
+    out += spread("dead-band", dead_band, "threshold_a", largest * np.geomspace(0.003, 0.3, 8), positive=True)
     return out + step_entries(recording)
 
 
@@ -209,7 +216,7 @@ def step_entries(recording: Series) -> list[Entry]:
     shown = shown_step(reading)
     if shown > max(1.5 * recording.resolution, 1e-3 * rms):
         grid.append(shown)
-    return spread("quantisation", quantised, "step_a", np.unique(grid))
+    return spread("quantisation", quantised, "step_a", np.unique(grid), positive=True)
 
 
 def shown_step(reading: Array) -> float:
@@ -221,21 +228,31 @@ def shown_step(reading: Array) -> float:
 
 
 def quantised(series: Series, step: float) -> Array:
-    """Error of rounding to the step."""
-    return np.round(series.x / step) * step - series.x
+    """Error of rounding to the step, its mean over the stated noise (Fourier series of the saw-tooth)."""
+    if series.noise < 0.02 * step:
+        return np.round(series.x / step) * step - series.x
+    out = np.zeros(len(series.x))
+    for order in range(1, 40):
+        damping = np.exp(-2.0 * (np.pi * order * series.noise / step) ** 2)
+        if damping < 1e-4:
+            break
+        out += (-1) ** order * damping * step / (np.pi * order) * np.sin(2 * np.pi * order * series.x / step)
+    return out
 
 
 def timing_entries(recording: Series) -> list[Entry]:
     """What depends on the past of the signal."""
     step = recording.step_s
     last = max(min(recording.span_s / 8, 500 * step), 4 * step)
-    out = spread("lag", lag, "tau_s", times(step / 4, last, 2.2))
-    out += spread("moving-average", average, "window_s", times(step / 2, last, 2.2))
+    out = spread("lag", lag, "tau_s", times(step / 4, last, 2.2), positive=True)
+    out += spread("moving-average", average, "window_s", times(step / 2, last, 2.2), positive=True)
     out += spread("delay", delay, "delay_s", times(step / 8, max(last / 4, step), 2.2))
-    out.append(Entry("clock-skew", skew, coefficients=(("skew_ppm", 0.0),)))
+    for build in (skew_fast, skew_slow):
+        out += spread("clock-skew", build, "skew_ppm", 1e6 / elapsed(recording) * times(step / 8, 5 * step, 2.0), positive=True)
     for duty in (0.2, 0.5, 0.8):
         build = window_of(duty)
-        out += spread("sampled-window", build, "period_s", times(2 * step, max(last / 4, 4 * step), 2.0))
+        grid = times(2 * step, max(last / 4, 4 * step), 2.0)
+        out += spread("sampled-window", build, "period_s", grid, positive=True)
     return out
 
 
@@ -254,10 +271,20 @@ def delay(series: Series, delay_s: float) -> Array:
     return filters.by_segment(filters.shifted, series.segments, series.t_s, series.x, delay_s) - series.x
 
 
-def skew(series: Series, _: float) -> Array:
-    """−t·di/dt·1e−6: a clock that runs fast by 1 ppm reads the past."""
-    slope = filters.by_segment(filters.derivative, series.segments, series.t_s, series.x)
-    return -1e-6 * series.t_s * slope
+def elapsed(series: Series) -> float:
+    """From the clock's zero to the last row, in s."""
+    return float(np.abs(series.t_s).max())
+
+
+def skew_fast(series: Series, ppm: float) -> Array:
+    """i(t/(1 + skew)) − i: a clock that runs fast reads the past."""
+    past = [np.interp(series.t_s[part] / (1.0 + 1e-6 * ppm), series.t_s[part], series.x[part]) for part in series.segments]
+    return np.concatenate(past) - series.x
+
+
+def skew_slow(series: Series, ppm: float) -> Array:
+    """The same for a slow clock, `ppm` by its amount."""
+    return skew_fast(series, -ppm)
 
 
 def window_of(duty: float) -> Build:
@@ -308,7 +335,8 @@ def range_entries(recording: Series) -> list[Entry]:
     grid = times(recording.step_s / 10, 30 * recording.step_s, 2.5)
     return [
         Entry("range-mismatch", mismatch, coefficients=two),
-        *spread("range-handover", handover, "tau_s", grid),
+        *spread("range-handover", handover_of(False), "tau_s", grid, positive=True),
+        *spread("range-handover", handover_of(True), "tau_s", grid, positive=True),
     ]
 
 
@@ -317,13 +345,18 @@ def mismatch(series: Series, _: float) -> Array:
     return np.column_stack([series.other["range_high"], series.other["range_high"] * series.x])
 
 
-def handover(series: Series, tau_s: float) -> Array:
-    """Memory of the old range."""
-    scale = np.where(series.other["range_high"] > 0.5, RANGE_RATIO, 1.0)
-    out = np.empty(len(series.x))
-    for part in series.segments:
-        out[part] = filters.handover(series.t_s[part], series.x[part], scale[part], tau_s)
-    return out
+def handover_of(late: bool) -> Build:
+    """A range that begins at its first row, or (late) at the row before."""
+
+    def build(series: Series, tau_s: float) -> Array:
+        """Memory of the old range."""
+        scale = np.where(series.other["range_high"] > 0.5, RANGE_RATIO, 1.0)
+        out = np.empty(len(series.x))
+        for part in series.segments:
+            out[part] = filters.handover(series.t_s[part], series.x[part], scale[part], tau_s, late)
+        return out
+
+    return build
 
 
 # Battery ------------------------------------------------------------------------------------------------------------
@@ -333,24 +366,25 @@ def battery_entries(recording: Series) -> list[Entry]:
     """Effects that a cell's voltage can show."""
     step, span = recording.step_s, recording.span_s
     out = [
-        Entry("coulombic-efficiency", lost_charge, coefficients=(("lost_share", 0.0),)),
-        Entry("parasitic-load", parasitic, coefficients=(("load_a", 0.0),)),
+        Entry("coulombic-efficiency", lost_charge, coefficients=(("lost_share", 0.0),), positive=True),
+        Entry("parasitic-load", parasitic, coefficients=(("load_a", 0.0),), positive=True),
         Entry("capacity", capacity, coefficients=(("relative_change", 0.0),)),
     ]
-    out += spread("polarisation", polarisation, "tau_s", times(step, max(span / 2, 4 * step), 2.5))
+    out += spread("polarisation", polarisation, "tau_s", times(step, max(span / 2, 4 * step), 2.5), positive=True)
     slow = times(max(20 * step, 5.0), max(span, 100 * step), 2.5)
-    out += spread("diffusion", diffusion, "tau_s", slow, coefficients=(("r_ohm", 0.0),))
-    out += spread("ocv-hysteresis", ocv_hysteresis, "gamma", np.geomspace(3, 3000, 7), coefficients=(("m_v", 0.0),))
-    out += spread("resistance-soc", soc_resistance, "knee_soc", np.array([0.1, 0.2, 0.35, 0.6]), coefficients=(("rise", 0.0),))
+    out += spread("diffusion", diffusion, "tau_s", slow, coefficients=(("r_ohm", 0.0),), positive=True)
+    gammas, knees = np.geomspace(3, 3000, 7), np.array([0.1, 0.2, 0.35, 0.6])
+    out += spread("ocv-hysteresis", ocv_hysteresis, "gamma", gammas, coefficients=(("m_v", 0.0),), positive=True)
+    out += spread("resistance-soc", soc_resistance, "knee_soc", knees, coefficients=(("rise", 0.0),), positive=True)
     if "temperature_c" in recording.other:
         out += [
-            *spread("resistance-temperature", arrhenius, "b_k", np.array([1000.0, 2000.0, 4000.0])),
+            Entry("resistance-temperature", arrhenius, positive=True),
             Entry("entropic", lambda s, _: s.battery.cells * warmth(s), coefficients=(("v_per_k", 0.0),)),
         ]
     else:
         # Where the temperature is recorded, it holds the warming.
         warm = times(max(10 * step, 10.0), max(span / 2, 100.0), 3.0)
-        out += spread("cell-self-heating", cell_heating, "tau_s", warm)
+        out += spread("cell-self-heating", cell_heating, "tau_s", warm, positive=True)
     return out
 
 
@@ -403,14 +437,14 @@ def soc_resistance(series: Series, knee: float) -> Array:
     return -ohms(series) * series.x * np.maximum(1.0 - series.other["soc"] / knee, 0.0)
 
 
-def arrhenius(series: Series, b_k: float) -> Array:
-    """−R·i·(exp(B·(1/T − 1/298.15)) − 1)."""
+def arrhenius(series: Series, _: float) -> Array:
+    """−R·i·(exp(B·(1/T − 1/298.15)) − 1) at the B of a usual cell."""
     kelvin = series.other["temperature_c"] + ZERO_C_IN_K
-    return -ohms(series) * series.x * np.expm1(b_k * (1.0 / kelvin - 1.0 / 298.15))
+    return -ohms(series) * series.x * np.expm1(USUAL_B_K * (1.0 / kelvin - 1.0 / 298.15))
 
 
 def cell_heating(series: Series, tau_s: float) -> Array:
-    """R·i·LP(R·i²)/298²·2000 K: the resistance falls by the Arrhenius slope of a usual cell, for 1 K/W."""
+    """R·i·LP(R·i²)·B/298²: the resistance falls by the Arrhenius slope of a usual cell, for 1 K/W."""
     losses = ohms(series) * series.x**2
     warm = filters.by_segment(filters.low_pass, series.segments, series.t_s, losses, tau_s, 0.0)
-    return ohms(series) * series.x * warm * 2000.0 / 298.15**2
+    return ohms(series) * series.x * warm * USUAL_B_K / 298.15**2

@@ -24,15 +24,19 @@ def low_pass(t_s: Array, x: Array, tau_s: float, start: float | None = None) -> 
     state = float(x[0]) if start is None else start
     if len(x) < 2:
         return np.full(len(x), state)
-    step = np.maximum(np.diff(t_s), 1e-9)
-    ratio = step / tau_s
-    keep = np.exp(-ratio)
-    now = 1.0 + np.expm1(-ratio) / ratio
-    before = -np.expm1(-ratio) - now
+    step = np.diff(t_s)
+    keep, now, before = ramp(step, tau_s)
     if np.ptp(step) < 1e-3 * step[0]:
         push = now[0] * x[1:] + before[0] * x[:-1]
         return np.concatenate([[state], lfilter([1.0], [1.0, -keep[0]], push, zi=[keep[0] * state])[0]])
     return recursion(keep, now * x[1:] + before * x[:-1], state)
+
+
+def ramp(step_s: Array, tau_s: float) -> tuple[Array, Array, Array]:
+    """Weights of the last state, of the new and of the old input, for a straight line over each step."""
+    ratio = np.maximum(step_s, 1e-9) / tau_s
+    now = 1.0 + np.expm1(-ratio) / ratio
+    return np.exp(-ratio), now, -np.expm1(-ratio) - now
 
 
 def recursion(keep: Array, push: Array, state: float) -> Array:
@@ -105,9 +109,17 @@ def stops(t_s: Array, x: Array, coercivity: float) -> Array:
     return total / limits.sum()
 
 
-def handover(t_s: Array, x: Array, scale: Array, tau_s: float) -> Array:
-    """Error of a low-pass that keeps the old range's product at the new range's scale: S·LP(x/S) − LP(x)."""
-    return scale * low_pass(t_s, x / scale, tau_s) - low_pass(t_s, x, tau_s)
+def handover(t_s: Array, x: Array, scale: Array, tau_s: float, late: bool) -> Array:
+    """Error of a low-pass that keeps the old range's product at the new range's scale: S·LP(x/S) − LP(x).
+
+    A range begins at the row that first tells of it or, `late`, at the row before.
+    """
+    if len(x) < 2:
+        return np.zeros(len(x))
+    keep, now, before = ramp(np.diff(t_s), tau_s)
+    during = scale[1:] if late else scale[:-1]
+    product = recursion(keep, (now * x[1:] + before * x[:-1]) / during, x[0] / scale[0])
+    return scale * product - low_pass(t_s, x, tau_s)
 
 
 def direction_memory(t_s: Array, current_a: Array, gamma: float, capacity_ah: float) -> Array:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import lstsq, qr
 from scipy.optimize import minimize_scalar
+from scipy.stats import f as f_distribution
 
-from dictionary import Entry, dictionary, nuisances
+from dictionary import MOST_OF_ONE, Entry, dictionary, nuisances
 from result import Fitted
 from series import Series
 
@@ -18,6 +20,8 @@ Array = np.ndarray
 Z_1_PERCENT = 2.5758
 # No more effects than the library has rows for one view.
 MOST_ENTRIES = 20
+# A difference of BIC below this is "not worth more than a bare mention" (Kass and Raftery 1995).
+NO_EVIDENCE = 2.0
 
 
 def straight_line(recording: Series) -> Fitted:
@@ -90,8 +94,11 @@ class Stepwise:
         left, basis = self.left(model)
         rows = len(left)
         energy = float(left @ left)
+        taken = Counter(entry.id for entry in model.entries)
         for entry, columns in zip(self.entries, self.pool):
-            gain = gain_of(self.whiten(columns, model.phi), basis, left)
+            if taken[entry.id] >= MOST_OF_ONE.get(entry.id, 1):
+                continue
+            gain = gain_of(self.whiten(columns, model.phi), basis, left, entry.positive)
             fall = -rows * np.log(max(1.0 - gain / energy, 1e-12)) - cost(entry) * np.log(rows)
             if fall > best:
                 best, chosen = fall, entry
@@ -108,7 +115,7 @@ class Stepwise:
 
         def loss(value: float) -> float:
             columns = self.whiten(unit(self.columns(entry.moved(value))), model.phi)
-            return -gain_of(columns, basis, left)
+            return -gain_of(columns, basis, left, entry.positive)
 
         span = (entry.low, entry.high)
         found = minimize_scalar(loss, bounds=span, method="bounded", options={"xatol": 1e-3 * (span[1] - span[0])})
@@ -142,6 +149,39 @@ class Stepwise:
         """Mean square of what the model leaves, whitened."""
         left, _ = self.left(model)
         return float(left @ left) / len(left)
+
+    def equivalents(self, model: Model) -> list[list[str]]:
+        """For each entry taken, the effects that would do in its stead: BIC within 2, the usual "no evidence"."""
+        out = []
+        for place, entry in enumerate(model.entries):
+            rest = self.fit(model.entries[:place] + model.entries[place + 1 :], model.blocks[: place + 1] + model.blocks[place + 2 :], model.phi)
+            rest = Model(rest.entries, rest.blocks, model.phi, rest.score)
+            own = self.worth(entry, rest)
+            others = {e.id for e in rest.entries}
+            found = {entry.id}
+            for name, other in self.best_of_each(rest).items():
+                if name not in found and name not in others and self.worth(self.tune(other, rest), rest) > own - NO_EVIDENCE:
+                    found.add(name)
+            if len(found) > 1:
+                out.append(sorted(found))
+        return out
+
+    def worth(self, entry: Entry, model: Model) -> float:
+        """By how much BIC falls with the entry, at the model's correlation of errors."""
+        left, basis = self.left(model)
+        columns = self.whiten(unit(self.columns(entry)), model.phi)
+        share = gain_of(columns, basis, left, entry.positive) / max(float(left @ left), 1e-300)
+        return -len(left) * np.log(max(1.0 - share, 1e-12)) - cost(entry) * np.log(len(left))
+
+    def best_of_each(self, model: Model) -> dict[str, Entry]:
+        """The entry of each effect that lowers the sum of squares most."""
+        left, basis = self.left(model)
+        best: dict[str, tuple[float, Entry]] = {}
+        for entry, columns in zip(self.entries, self.pool):
+            gain = gain_of(self.whiten(columns, model.phi), basis, left, entry.positive)
+            if gain > best.get(entry.id, (0.0, entry))[0]:
+                best[entry.id] = (gain, entry)
+        return {name: entry for name, (_, entry) in best.items()}
 
     def fit(self, entries: list[Entry], blocks: list[Array], phi: float = 0.0) -> Model:
         """Least squares (AR(1): Cochrane–Orcutt, Prais–Winsten's first row) and BIC."""
@@ -205,12 +245,12 @@ def unit(columns: Array) -> Array:
     return columns / np.where(size > 0, size, 1.0)
 
 
-def orthonormal(columns: Array) -> Array:
+def orthonormal(columns: Array, floor: float = 1e-7) -> Array:
     """An orthonormal basis of the columns; dependent ones fall away."""
     if columns.shape[1] == 0:
         return columns
     basis, triangle, _ = qr(unit(columns), mode="economic", pivoting=True, check_finite=False)
-    return basis[:, np.abs(np.diag(triangle)) > 1e-7]
+    return basis[:, np.abs(np.diag(triangle)) > floor]
 
 
 def cost(entry: Entry) -> int:
@@ -218,13 +258,14 @@ def cost(entry: Entry) -> int:
     return len(entry.coefficients) + entry.tuned
 
 
-def gain_of(columns: Array, basis: Array, left: Array) -> float:
-    """By how much the columns lower the sum of squares beyond the basis."""
+def gain_of(columns: Array, basis: Array, left: Array, positive: bool) -> float:
+    """By how much the columns lower the sum of squares beyond the basis; `positive`: 0 if only a negative one would."""
     rest = columns - basis @ (basis.T @ columns)
     # Nothing new within rounding: the column is one of the model's.
     if rest.shape[1] == 1:
-        size = float(rest[:, 0] @ rest[:, 0])
-        return float(rest[:, 0] @ left) ** 2 / size if size > 1e-9 * float(columns[:, 0] @ columns[:, 0]) else 0.0
+        size, along = float(rest[:, 0] @ rest[:, 0]), float(rest[:, 0] @ left)
+        known = size <= 1e-9 * float(columns[:, 0] @ columns[:, 0])
+        return 0.0 if known or (positive and along < 0) else along**2 / size
     projected = orthonormal(rest).T @ left
     return float(projected @ projected)
 
@@ -235,7 +276,9 @@ def stepwise(recording: Series, ar1: bool) -> Fitted:
     model = search.run()
     coefficients = search.solve(model.columns, model.phi)
     note = f"{len(search.entries)} entries in the dictionary, {len(model.entries)} taken" + (f", phi {model.phi:.4f}" if ar1 else "")
-    return from_entries(search.base.shape[1], model.entries, coefficients, note)
+    fitted = from_entries(search.base.shape[1], model.entries, coefficients, note)
+    fitted.classes = search.equivalents(model)
+    return fitted
 
 
 def from_entries(base: int, entries: list[Entry], coefficients: Array, note: str) -> Fitted:
@@ -252,3 +295,72 @@ def from_entries(base: int, entries: list[Entry], coefficients: Array, note: str
         return columns @ coefficients
 
     return Fitted(sorted({entry.id for entry in entries}), predict, parameters, note)
+
+
+def all_at_once(recording: Series) -> Fitted:
+    """Least squares on the whole dictionary; an effect is named if an F-test says that its columns are needed.
+
+    F-test of all columns of an effect together against the model without them, 1 % over the number of effects
+    (Bonferroni), independent errors. Columns that the others make up are left out. If what is left is singular to
+    eight digits, the prediction is by ridge regression, its weight by five-fold cross-validation over contiguous blocks.
+    """
+    valid = recording.valid
+    entries = dictionary(recording)
+    blocks = [nuisances(recording), *(entry.columns(recording) for entry in entries)]
+    owner = np.repeat(["", *(entry.id for entry in entries)], [block.shape[1] for block in blocks])
+    columns, target = np.column_stack(blocks)[valid], recording.residual[valid]
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns / size
+    _, triangle, order = qr(columns, mode="economic", pivoting=True, check_finite=False)
+    diagonal = np.abs(np.diag(triangle))
+    kept = np.sort(order[: len(diagonal)][diagonal > 1e-9 * diagonal[0]])
+    singular = len(kept) < columns.shape[1] or np.linalg.cond(columns[:, kept]) > 1e8
+    named = needed(columns[:, kept], target, owner[kept])
+    weight = ridge_weight(columns, target) if singular else 0.0
+    coefficients = ridge(columns, target, weight) / size
+
+    def predict(series: Series) -> Array:
+        return np.column_stack([nuisances(series), *(entry.columns(series) for entry in entries)]) @ coefficients
+
+    note = f"{columns.shape[1]} columns; " + (f"ridge, weight {weight:.1e}" if singular else "ordinary least squares")
+    return Fitted(named, predict, None, note)
+
+
+def needed(columns: Array, target: Array, owner: Array) -> list[str]:
+    """Effects whose columns together pass the F-test."""
+    basis, triangle = qr(columns, mode="economic", check_finite=False)
+    along = basis.T @ target
+    freedom = len(target) - columns.shape[1]
+    variance = max(float(target @ target - along @ along) / freedom, 1e-300)
+    effects = sorted(set(owner.tolist()) - {""})
+    named = []
+    for effect in effects:
+        own = owner == effect
+        # What only this effect's columns reach of the target.
+        others = orthonormal(triangle[:, ~own], 1e-10)
+        rise = float(along @ along) - float(np.sum((others.T @ along) ** 2))
+        if f_distribution.sf(rise / own.sum() / variance, own.sum(), freedom) < 0.01 / len(effects):
+            named.append(effect)
+    return named
+
+
+def ridge(columns: Array, target: Array, weight: float) -> Array:
+    """Least squares with a penalty on columns of length 1."""
+    if weight == 0.0:
+        return lstsq(columns, target, check_finite=False)[0]
+    wide = columns.shape[1]
+    return np.linalg.solve(columns.T @ columns + weight * np.eye(wide), columns.T @ target)
+
+
+def ridge_weight(columns: Array, target: Array) -> float:
+    """The weight with the least error over five contiguous blocks."""
+    blocks = np.array_split(np.arange(len(target)), 5)
+
+    def loss(weight: float) -> float:
+        total = 0.0
+        for block in blocks:
+            rest = np.setdiff1d(np.arange(len(target)), block, assume_unique=True)
+            total += float(np.sum((target[block] - columns[block] @ ridge(columns[rest], target[rest], weight)) ** 2))
+        return total
+
+    return min(10.0 ** np.arange(-9, 2), key=loss)

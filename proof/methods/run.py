@@ -32,6 +32,10 @@ METHODS: dict[str, tuple[str, str, tuple]] = {
     "straight-line": ("regression", "straight_line", ()),
     "bic": ("regression", "stepwise", (False,)),
     "bic-ar1": ("regression", "stepwise", (True,)),
+    "all-at-once": ("regression", "all_at_once", ()),
+    "pysindy": ("sindy", "fit", ()),
+    "gaussian-process": ("gaussian", "fit", ()),
+    "pybop": ("ecm", "fit", ()),
 }
 
 

@@ -56,6 +56,7 @@ class Series:
     battery: Battery | None = None
     full_scale: float = 0.0
     resolution: float = 0.0
+    noise: float = 0.0
 
     @property
     def step_s(self) -> float:
@@ -131,6 +132,7 @@ def sensor_series(path: pathlib.Path, table: pd.DataFrame, segments: list[slice]
         other=other,
         full_scale=float(sensor.get("full_scale", 0.0)),
         resolution=float(sensor.get("step", 0.0)),
+        noise=float(sensor.get("noise", 0.0)),
     )
 
 
