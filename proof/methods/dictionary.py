@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 import filters
 from series import Series
@@ -298,7 +299,7 @@ def window_of(duty: float) -> Build:
 
 
 def line_entries(recording: Series) -> list[Entry]:
-    """Hum: mains lines folded by the sampling rate, and the three highest lines of the residual's spectrum."""
+    """Hum: mains lines folded by the sampling rate, and up to three lines that stand out of the residual's spectrum."""
     part = max(recording.segments, key=lambda p: p.stop - p.start)
     step = recording.step_s
     t_s = np.arange(recording.t_s[part][0], recording.t_s[part][-1], step)
@@ -308,11 +309,17 @@ def line_entries(recording: Series) -> list[Entry]:
     residual = np.interp(t_s, recording.t_s[part][known], recording.residual[part][known])
     power = np.abs(np.fft.rfft((residual - residual.mean()) * np.hanning(len(residual)))) ** 2
     width = 1.0 / (len(t_s) * step)
+    # Power over that of its neighbourhood: the median of an exponential distribution is ln 2 of its mean.
+    ratio = power / np.maximum(median_filter(power, 101, mode="nearest") / np.log(2.0), 1e-300)
+    ratio[:4] = ratio[-1] = 0.0
     frequencies = []
     for _ in range(3):
-        peak = int(np.argmax(power[4:-1])) + 4
+        peak = int(np.argmax(ratio))
+        # One in a hundred spectra of noise has such a peak anywhere.
+        if ratio[peak] < np.log(len(power) / 0.01):
+            break
         frequencies.append(peak * width)
-        power[max(peak - 3, 0) : peak + 4] = 0.0
+        ratio[max(peak - 3, 0) : peak + 4] = 0.0
     for mains in (50.0, 60.0, 100.0, 120.0):
         folded = abs(mains - round(mains * step) / step)
         if folded > 4 * width:
