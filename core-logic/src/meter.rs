@@ -515,6 +515,12 @@ impl MeterChannel {
         self.set_calibration(MeterCalibration::new(config));
     }
 
+    /// The configuration in use.
+    #[must_use]
+    pub const fn config(&self) -> &MeterConfig {
+        &self.config
+    }
+
     /// Sets the counters to values kept over a reset. What was summed before is replaced.
     pub fn restore(
         &mut self,
