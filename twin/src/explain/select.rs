@@ -211,7 +211,7 @@ fn marked(
             card.id,
             percent(gain)
         ));
-        let smooth = fit(bench, &base, None);
+        let smooth = missed(bench, fit(bench, &base, None));
         let model = smooth.model.with(Member {
             effect,
             values: mark.values,
@@ -246,6 +246,21 @@ fn marked(
         };
     }
     (now, named)
+}
+
+/// Leaves out what is too small beside the others: steps make single readings jump by what hardly moves them.
+fn missed(bench: &Workbench<'_>, mut now: Fit) -> Fit {
+    let mut index = 0;
+    while index < now.model.members.len() {
+        let without = fit(bench, &now.model.without(index), None);
+        let gain = share(bench, &without, &now);
+        if obstacle(bench, &without, &now, index, gain).is_some() {
+            now = without;
+        } else {
+            index += 1;
+        }
+    }
+    now
 }
 
 /// Fits the most promising entries in place of nothing.
