@@ -99,7 +99,8 @@ def range_mismatch(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarra
 def range_handover(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarray:
     """The multiplier's low-pass keeps the product in the old range's scale.
 
-    On the fine grid, changes midway between its points. The product's error decays between changes; at a change what the low-pass holds is read in the new scale.
+    On the fine grid, changes midway between its points. The product's error decays between changes; at a change what the
+    low-pass holds is read in the new scale.
     """
     step_s, tau_s = stretch.step_s / FINE, values["tau_s"]
     held = low_pass(y, step_s, tau_s)
