@@ -413,8 +413,10 @@ Rload out 0 10k
 """, A_PER_V, {})
 
 
+CLEAN = "clean"
 OPAMP_DEVICES = "bipolar transistors (Gummel–Poon), resistors, capacitors"
 KINDS: dict[str, Kind] = {
+    CLEAN: Kind(lambda _: Circuit(inverter("Rf sum out 10k"), -A_PER_V, {}), OPAMP_DEVICES, [], [], "nothing is concealed"),
     "lag": Kind(lag, OPAMP_DEVICES, [["lag"]], [], "R·C in the feedback"),
     "gain": Kind(gain, OPAMP_DEVICES, [["gain"]], [], "a resistor of the amplifier"),
     "offset": Kind(offset, OPAMP_DEVICES, [["offset"]], [], "areas of the input transistors: kT/q·ln"),
@@ -433,10 +435,10 @@ KINDS: dict[str, Kind] = {
                                "a bridge follows its supply", ("supply_v",)),
     "core-saturation": Kind(core_saturation, "XSPICE lcouple and core, B(H) of a measured ferrite",
                             [["core-saturation", "clipping"]], ["gain"],
-                            "the ferrite saturates abruptly, so that a rail is as right; below, its permeability is not constant"),
+                            "the ferrite saturates abruptly: a rail is as right; below, its permeability is not constant"),
     "core-hysteresis": Kind(core_hysteresis, "capacitors, diodes", [["core-hysteresis"]], ["lag", "moving-average", "delay"],
-                            "memory that follows each turn of the current, as a core with a gap has it; a diode's clamp rises with "
-                            "the logarithm of the rate, which is a little lag"),
+                            "memory that follows each turn of the current, as a core with a gap has it; a diode's clamp "
+                            "rises with the logarithm of the rate, which is a little lag"),
     "core-preisach": Kind(core_preisach, "XSPICE hyst", [["core-hysteresis"]], [],
                           "memory of the sign of what flowed, as a core without a gap has it; the table's law is another"),
     "delay": Kind(delay, "transmission line (T)", [["delay"]], [], "delay of the line"),
@@ -494,8 +496,8 @@ quit
     with tempfile.TemporaryDirectory() as folder:
         (pathlib.Path(folder) / "circuit.cir").write_text(text, encoding="utf-8")
         try:
-            ran = subprocess.run(["ngspice", "-b", "circuit.cir"], cwd=folder, capture_output=True, text=True, timeout=TIME_LIMIT_S,
-                                 check=False)
+            ran = subprocess.run(
+                ["ngspice", "-b", "circuit.cir"], cwd=folder, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=False)
         except FileNotFoundError as error:
             raise ValueError("ngspice is not installed (Debian: apt install ngspice)") from error
         except subprocess.TimeoutExpired as error:
@@ -533,13 +535,18 @@ def sized(kind: Kind, strength: float, stretch: Stretch) -> tuple[Circuit, np.nd
 def make(case: dict, out: pathlib.Path) -> None:
     """Writes the case's files."""
     names = [effect["id"] for effect in case["effects"]]
-    if len(names) != 1 or names[0] not in KINDS:
-        raise ValueError(f"effects: expected one of {', '.join(KINDS)}, found {', '.join(names) or 'none'}")
+    name = names[0] if names else CLEAN
+    if len(names) > 1 or name not in KINDS:
+        raise ValueError(f"effects: expected none or one of {', '.join(KINDS)}, found {', '.join(names)}")
     if case["drive"] not in DRIVES:
         raise ValueError(f"drive: expected one of {', '.join(DRIVES)}, found {case['drive']!r}")
-    kind = KINDS[names[0]]
+    kind = KINDS[name]
     fitted, holdout = stretches(case | {"rows": min(case["rows"], MOST_ROWS)})
-    circuit, fitted_a = sized(kind, case["effects"][0]["strength"], fitted)
+    if name == CLEAN:
+        circuit = kind.circuit(0.0)
+        fitted_a = simulate(circuit, kind, fitted)
+    else:
+        circuit, fitted_a = sized(kind, case["effects"][0]["strength"], fitted)
     stated = noise(case["noise"])
 
     def made(stretch: Stretch, quiet_a: np.ndarray, purpose: str) -> Made:
@@ -547,17 +554,18 @@ def make(case: dict, out: pathlib.Path) -> None:
         return Made(stretch, rounded(quiet_a + noise_a, stated.step_a), quiet_a)
 
     required, classes, why = kind.required, [ids for ids in kind.required if len(ids) > 1], kind.why
-    if names[0] in EDGES:
-        same, classes, reason = edge_names(fitted, names[0], circuit.values[names[0]], stated)
+    if name in EDGES:
+        same, classes, reason = edge_names(fitted, name, circuit.values[name], stated)
         required, why = [same], f"{why}; {reason}"
     truth = {
         "kind": "b",
         "maker": f"ngspice: {kind.devices}; noise added behind it",
-        "effects": [{"id": name, "parameters": circuit.values.get(name)} for name in circuit.values or names],
+        "effects": [{"id": one, "parameters": circuit.values.get(one)} for one in names],
         "required": required,
         "allowed": kind.allowed,
         "class_ids": classes,
         "why": why,
         "where": None,
     }
-    write_case(out, made(fitted, fitted_a, "noise"), made(holdout, simulate(circuit, kind, holdout), "noise held out"), stated, truth)
+    holdout_a = simulate(circuit, kind, holdout)
+    write_case(out, made(fitted, fitted_a, "noise"), made(holdout, holdout_a, "noise held out"), stated, truth)

@@ -64,7 +64,7 @@ def stream(case: dict, purpose: str) -> np.random.Generator:
 
 
 def coloured(random: np.random.Generator, rows: int, correlation_rows: float, rms: float) -> np.ndarray:
-    """Noise of first order (AR(1)) of the given rms, in equilibrium from the start; its correlation falls to 1/e in so many rows."""
+    """Noise of first order (AR(1)), in equilibrium from the start; its correlation falls to 1/e in so many rows."""
     kept = np.exp(-1.0 / correlation_rows)
     steps = random.standard_normal(rows) * np.sqrt(1.0 - kept**2)
     steps[0] = random.standard_normal()

@@ -97,9 +97,10 @@ def range_mismatch(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarra
 
 
 def range_handover(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarray:
-    """The multiplier's low-pass keeps the product in the old range's scale. On the fine grid, changes midway between its points.
+    """The multiplier's low-pass keeps the product in the old range's scale.
 
-    The product's error decays between changes; at a change what the low-pass holds is read in the new scale.
+    On the fine grid, changes midway between its points. The product's error decays between changes; at a change what the
+    low-pass holds is read in the new scale.
     """
     step_s, tau_s = stretch.step_s / FINE, values["tau_s"]
     held = low_pass(y, step_s, tau_s)
@@ -147,14 +148,15 @@ def dead_band(y: np.ndarray, values: Values, _: Stretch) -> np.ndarray:
 
 def eddy_current(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarray:
     """A part of the field diffuses through metal: half-order lag 1/(1 + √(jωτ)), step response 1 − erfcx(√(t/τ))."""
-    return y + values["share"] * (after_steps(y, stretch, lambda t: 1.0 - erfcx(np.sqrt(t / values["tau_s"]))) - (y - y[0]))
+    diffused = after_steps(y, stretch, lambda t: 1.0 - erfcx(np.sqrt(t / values["tau_s"])))
+    return y + values["share"] * (diffused - (y - y[0]))
 
 
 def creep(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarray:
     """The reading goes on with the logarithm of the time since a change."""
     span_s = stretch.rows * stretch.step_s
-    law = lambda t: np.log1p(t / values["tau_s"]) / np.log1p(span_s / values["tau_s"])
-    return y + values["share"] * after_steps(y, stretch, law)
+    whole = np.log1p(span_s / values["tau_s"])
+    return y + values["share"] * after_steps(y, stretch, lambda t: np.log1p(t / values["tau_s"]) / whole)
 
 
 def after_steps(y: np.ndarray, stretch: Stretch, response: Callable) -> np.ndarray:
@@ -177,7 +179,8 @@ def gain_step(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarray:
 
 def random_walk(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarray:
     """The zero walks at random, the same walk for the same stretch."""
-    walk = np.random.default_rng([int(values["walk"]), stretch.rows, int(1e3 * abs(y).max())]).standard_normal(len(y)).cumsum()
+    of_stretch = int(1e3 * stretch.temp_c[0])
+    walk = np.random.default_rng([int(values["walk"]), of_stretch]).standard_normal(len(y)).cumsum()
     return y + values["a_per_root_row"] * walk
 
 
@@ -228,7 +231,7 @@ EFFECTS: dict[str, Effect] = {
         "fine", lambda k, r: {"period_s": k * 0.01, "duty": r.uniform(0.3, 0.7)}, sampled_window),
     "hum": Effect(
         "output", lambda k, r: {"frequency_hz": r.uniform(0.3, 4.7), "amplitude_a": k},
-        lambda y, v, s: y + v["amplitude_a"] * np.sin(2.0 * np.pi * v["frequency_hz"] * s.t_s * 0.1 / s.step_s)),
+        lambda y, v, s: y + v["amplitude_a"] * np.sin(2.0 * np.pi * v["frequency_hz"] * s.t_s)),
     "missing-codes": Effect(
         "output", lambda k, r: {"from_a": r.uniform(5.0, 20.0), "width_a": k}, missing_codes,
         lambda v: {"column": "i_ref_a", "from": v["from_a"], "to": v["from_a"] + v["width_a"], "absolute": False}),
@@ -256,16 +259,20 @@ PARTLY_TRUE = {
 }
 """Of effects outside the library: a name within it that is true of the data too, and why."""
 
+ONE_SIZE = ["core-saturation", "clipping", "sensor-self-heating", "quantisation", "core-hysteresis"]
 INSEPARABLE = {
     ("temperature", "offset-temperature"): (["offset"], [], "at one temperature a drift of the zero is a zero error"),
     ("temperature", "gain-temperature"): (["gain"], [], "at one temperature a drift of the sensitivity is a gain"),
     ("supply", "supply-ratiometric"): (["offset"], ["gain"], "at one supply its zero is an offset, its sensitivity a gain"),
     ("aux", "stray-field"): (["offset"], [], "a constant neighbour adds a constant"),
     ("range", "range-mismatch"): (["gain", "offset"], ["gain", "offset"], "in one range it is a gain and an offset"),
-    ("square", "gain"): (["core-saturation", "clipping", "sensor-self-heating"], [], "one size of current only: any error in proportion"),
-    ("square", "core-saturation"): (["gain", "clipping", "sensor-self-heating"], [], "one size of current only: any error in proportion"),
+    ("square", "gain"): (ONE_SIZE, [], "one size of current only: any error in proportion, any staircase, any memory"),
+    ("square", "core-saturation"): (["gain", *ONE_SIZE[1:]], [], "as for a gain on this drive"),
 }
 """What stands still (or the drive), and the effect: names that are as right, names that are true beside, and why."""
+
+
+MASKED_DRAWS = 8
 
 
 def chain(current: Stretch, hidden: list[tuple[str, Values]], noise_a: np.ndarray | float = 0.0) -> np.ndarray:
@@ -303,27 +310,26 @@ def sized(stretch: Stretch, name: str, strength: float, noise: Noise, random: Ca
         high += 1.5
     if excess(low) > 0.0 or excess(high) < 0.0:
         raise ValueError(f"{name}: strength {strength:g} cannot be had on this drive")
-    return effect.values(float(np.exp(brentq(excess, low, high, xtol=1e-4))), random())
+    return effect.values(float(np.exp(brentq(excess, low, high, xtol=1e-3))), random())
 
 
 def hidden_effects(case: dict, stretch: Stretch, noise: Noise) -> list[tuple[str, Values]]:
     """The concealed effects with their parameters.
 
-    With `options.masked` the free signs of each effect after the first are those, of 16 draws, with which the effects hide
-    one another most.
+    With `options.masked` their free signs and time constants are those, of MASKED_DRAWS, with which they hide one another most.
     """
-    hidden: list[tuple[str, Values]] = []
-    for position, wanted in enumerate(case["effects"]):
-        name = wanted["id"]
-        if name not in EFFECTS:
-            raise ValueError(f"effects: expected one of {', '.join(sorted(EFFECTS))}, found {name!r}")
-        draws = 16 if case["options"].get("masked") and position else 1
-        tried = [
-            (name, sized(stretch, name, wanted["strength"], noise, lambda: stream(case, f"{name} {draw}")))
-            for draw in range(draws)
+    for wanted in case["effects"]:
+        if wanted["id"] not in EFFECTS:
+            raise ValueError(f"effects: expected one of {', '.join(sorted(EFFECTS))}, found {wanted['id']!r}")
+
+    def drawn(draw: int) -> list[tuple[str, Values]]:
+        return [
+            (one["id"], sized(stretch, one["id"], one["strength"], noise, lambda: stream(case, f"{one['id']} {draw}")))
+            for one in case["effects"]
         ]
-        hidden.append(min(tried, key=lambda one: rms(chain(stretch, [*hidden, one]) - stretch.current_a)))
-    return hidden
+
+    tried = [drawn(draw) for draw in range(MASKED_DRAWS if case["options"].get("masked") else 1)]
+    return min(tried, key=lambda hidden: rms(chain(stretch, hidden) - stretch.current_a))
 
 
 EDGES = {"lag": ("tau_s", 1.0), "moving-average": ("window_s", 2.0), "delay": ("delay_s", 1.0)}
@@ -353,7 +359,7 @@ def edge_rivals(stretch: Stretch, name: str, values: Values, noise: Noise) -> di
         def away(share: float) -> float:
             return distance(reading - chain(stretch, [(rival, {parameter: share * mean_s})]), stretch.step_s, noise)
 
-        return float(minimize_scalar(away, bounds=(0.5, 1.5), method="bounded", options={"xatol": 1e-4}).fun)
+        return float(minimize_scalar(away, bounds=(0.5, 1.5), method="bounded", options={"xatol": 1e-3}).fun)
 
     return {rival: nearest(rival) for rival in EDGES if rival != name}
 
