@@ -1,0 +1,184 @@
+//! `prove`: the campaign that shows where `twin explain` is right, wrong or silent, and on whose data.
+
+mod board;
+mod case;
+mod make;
+mod methods;
+mod plan;
+mod process;
+mod real;
+mod run;
+mod score;
+mod seal;
+mod stats;
+mod table;
+mod tool;
+
+use std::{path::PathBuf, process::ExitCode, thread};
+
+use anyhow::{Context, Result};
+use clap::{Args, Parser, Subcommand};
+
+use crate::{
+    board::Board, make::Makers, methods::Methods, plan::Extent, run::Campaign, tool::Tool,
+};
+
+/// A bound of the quick campaign does not hold.
+const FAILED: u8 = 1;
+/// Something could not be done at all.
+const MISSING: u8 = 2;
+
+#[derive(Parser)]
+#[command(
+    name = "prove",
+    version,
+    about = "Shows where `twin explain` is right, wrong or silent, and on whose data"
+)]
+struct CommandLine {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Run what is not there yet, and write tables and pages
+    #[command(
+        after_help = "Example:\n  cargo xtask prove --quick     builds what is needed and calls this"
+    )]
+    Run(Run),
+    /// List the cases
+    List {
+        /// How much of the campaign
+        #[arg(long, value_enum, default_value = "full")]
+        plan: Extent,
+        /// The checkout's top folder
+        #[arg(long, default_value = ".")]
+        root: PathBuf,
+    },
+}
+
+#[derive(Args)]
+struct Run {
+    /// How much of the campaign
+    #[arg(long, value_enum, default_value = "full")]
+    plan: Extent,
+    /// The checkout's top folder
+    #[arg(long, default_value = ".")]
+    root: PathBuf,
+    /// Where data, results and tables go; a broken run goes on from there
+    #[arg(long)]
+    out: PathBuf,
+    /// Where the pages go; without it beside the tables
+    #[arg(long)]
+    docs: Option<PathBuf>,
+    /// The program under test
+    #[arg(long)]
+    twin: PathBuf,
+    /// The emulator; without it the emulated board is left out
+    #[arg(long, requires = "image")]
+    emulate: Option<PathBuf>,
+    /// The firmware image
+    #[arg(long, requires = "emulate")]
+    image: Option<PathBuf>,
+    /// The interpreter with the packages of proof/requirements.txt
+    #[arg(long, default_value = "python3")]
+    python: PathBuf,
+    /// The makers, if not those of the checkout
+    #[arg(long)]
+    makers: Option<PathBuf>,
+    /// Today's methods, if not those of the checkout
+    #[arg(long)]
+    methods: Option<PathBuf>,
+    /// Cases that run at once; without it one for each processor
+    #[arg(long)]
+    workers: Option<usize>,
+    /// Only cases whose id has this in it
+    #[arg(long)]
+    only: Option<String>,
+    /// Keep the data of every case, not only of those that went wrong
+    #[arg(long)]
+    keep: bool,
+}
+
+fn main() -> ExitCode {
+    match CommandLine::parse().command {
+        Command::Run(arguments) => match run(&arguments) {
+            Ok(true) => ExitCode::SUCCESS,
+            Ok(false) => ExitCode::from(FAILED),
+            Err(error) => {
+                eprintln!("error: {error:#}");
+                ExitCode::from(MISSING)
+            }
+        },
+        Command::List { plan, root } => match real::expected(&root.join("proof/expected.toml")) {
+            Ok(real) => {
+                for planned in plan::plan(plan, &real) {
+                    println!("{}", planned.case.id);
+                }
+                ExitCode::SUCCESS
+            }
+            Err(error) => {
+                eprintln!("error: {error:#}");
+                ExitCode::from(MISSING)
+            }
+        },
+    }
+}
+
+fn run(arguments: &Run) -> Result<bool> {
+    let absolute = |path: &PathBuf| {
+        std::path::absolute(path).with_context(|| path.display().to_string())
+    };
+    let root = absolute(&arguments.root)?;
+    let real = real::expected(&root.join("proof/expected.toml"))?;
+    let mut plan = plan::plan(arguments.plan, &real);
+    if let Some(part) = &arguments.only {
+        plan.retain(|planned| planned.case.id.contains(part.as_str()));
+    }
+    let board = match (&arguments.emulate, &arguments.image) {
+        (Some(emulate), Some(image)) => Some(Board {
+            emulate: absolute(emulate)?,
+            image: absolute(image)?,
+        }),
+        _ => None,
+    };
+    // The interpreter of an environment is a link; its path is what makes it that environment's.
+    let python = if arguments.python.components().count() > 1 {
+        absolute(&arguments.python)?
+    } else {
+        arguments.python.clone()
+    };
+    let workers = match arguments.workers {
+        Some(workers) => workers.max(1),
+        None => thread::available_parallelism().map_or(1, usize::from),
+    };
+    let campaign = Campaign {
+        out: absolute(&arguments.out)?,
+        tool: Tool {
+            program: absolute(&arguments.twin)?,
+            threads: 1,
+        },
+        makers: Makers {
+            python: python.clone(),
+            folder: match &arguments.makers {
+                Some(folder) => absolute(folder)?,
+                None => root.join("proof/makers"),
+            },
+        },
+        methods: Methods {
+            python,
+            folder: match &arguments.methods {
+                Some(folder) => absolute(folder)?,
+                None => root.join("proof/methods"),
+            },
+        },
+        board,
+        real,
+        workers,
+        keep: arguments.keep,
+        root,
+    };
+    let records = campaign.run(&plan)?;
+    println!("{} cases", records.len());
+    Ok(true)
+}
