@@ -14,7 +14,7 @@ use serde_json::{Map, Value, json};
 use crate::{
     case::{Case, Group, Planned, TrueEffect, Truth},
     make::Folders,
-    process, stats,
+    program, stats,
     table::Table,
 };
 
@@ -141,7 +141,7 @@ impl Board {
         if let Some(file) = calibration {
             command.arg("--calibration").arg(file);
         }
-        process::run(&mut command, LIMIT).context("emulate drive")?;
+        program::run(&mut command, LIMIT).context("emulate drive")?;
         Ok(())
     }
 

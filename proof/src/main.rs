@@ -1,20 +1,24 @@
 //! `prove`: the campaign that shows where `twin explain` is right, wrong or silent, and on whose data.
 
 mod board;
+mod bounds;
 mod case;
 mod make;
 mod methods;
+mod pages;
 mod plan;
-mod process;
+mod program;
 mod real;
+mod results;
 mod run;
 mod score;
 mod seal;
 mod stats;
+mod summary;
 mod table;
 mod tool;
 
-use std::{path::PathBuf, process::ExitCode, thread};
+use std::{fs, path::PathBuf, process, process::ExitCode, thread, time::Duration};
 
 use anyhow::{Context, Result};
 use clap::{Args, Parser, Subcommand};
@@ -179,6 +183,48 @@ fn run(arguments: &Run) -> Result<bool> {
         root,
     };
     let records = campaign.run(&plan)?;
-    println!("{} cases", records.len());
-    Ok(true)
+    let extent = match arguments.plan {
+        Extent::Quick => "quick",
+        Extent::Full => "full",
+    };
+    let processors = thread::available_parallelism().map_or(1, usize::from);
+    let summary = summary::summary(
+        &records,
+        extent,
+        seal::hash_file(&campaign.tool.program)?,
+        processors,
+    );
+    let pages = match &arguments.docs {
+        Some(docs) => absolute(docs)?,
+        None => campaign.out.join("pages"),
+    };
+    fs::create_dir_all(&pages).with_context(|| format!("making {}", pages.display()))?;
+    let results = pages.join("results.json");
+    fs::write(&results, results::text(&summary)?)
+        .with_context(|| format!("writing {}", results.display()))?;
+    let mut pictures = process::Command::new(&campaign.makers.python);
+    pictures
+        .arg("-B")
+        .arg(campaign.root.join("proof/pictures.py"))
+        .arg(&results)
+        .arg(&pages);
+    program::run(&mut pictures, Duration::from_secs(120)).context("proof/pictures.py")?;
+    pages::write(&summary, &pages)?;
+    for target in &summary.targets {
+        let met = match target.met {
+            Some(true) => "met",
+            Some(false) => "MISSED",
+            None => "",
+        };
+        println!("{:<6} {}: {} (wanted {})", met, target.what, target.found, target.wanted);
+    }
+    println!("{}", pages.join("index.md").display());
+    if arguments.plan == Extent::Full || arguments.only.is_some() {
+        return Ok(true);
+    }
+    let broken = bounds::broken(&summary, &records);
+    for one in &broken {
+        eprintln!("does not hold: {one}");
+    }
+    Ok(broken.is_empty())
 }

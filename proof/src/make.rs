@@ -11,7 +11,7 @@ use anyhow::{Context, Result, bail};
 
 use crate::{
     case::{Case, Planned},
-    process,
+    program,
     seal::{Safe, hash, hash_file},
 };
 
@@ -123,7 +123,7 @@ impl Makers {
             .arg("--list")
             .arg(&file);
         one_thread(&mut command);
-        let ran = process::run(&mut command, LIMIT * u32::try_from(list.len().max(1))?);
+        let ran = program::run(&mut command, LIMIT * u32::try_from(list.len().max(1))?);
         fs::remove_file(&file)?;
         ran.map(|_| ())
     }

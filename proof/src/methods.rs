@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     make::{Folders, one_thread},
-    process,
+    program,
 };
 
 /// For one recording.
@@ -89,7 +89,7 @@ impl Methods {
             .arg(&folder)
             .arg(&out);
         one_thread(&mut command);
-        process::run(&mut command, LIMIT)?;
+        program::run(&mut command, LIMIT)?;
         let text = fs::read_to_string(&out).with_context(|| format!("reading {}", out.display()))?;
         serde_json::from_str(&text).with_context(|| format!("reading {}", out.display()))
     }

@@ -96,7 +96,7 @@ impl Expected {
     pub fn truth(&self) -> Truth {
         Truth {
             kind: "a".to_owned(),
-            maker: "a real recording".to_owned(),
+            maker: self.object.clone(),
             required: self.required.clone(),
             allowed: self.allowed.clone(),
             why: Some(self.source.clone()),

@@ -9,7 +9,7 @@ use crate::{
 };
 
 /// From this strength on silence is a miss: an effect that moves the reading by nine tenths of the noise.
-const PLAIN: f64 = 3.0;
+pub const PLAIN: f64 = 3.0;
 
 /// How a case went.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]

@@ -74,11 +74,6 @@ impl Safe {
         fs::write(self.path(id), truth.to_string()).context("sealing")
     }
 
-    /// Whether a truth is there from an earlier run.
-    pub fn has(&self, id: &str) -> bool {
-        self.path(id).exists()
-    }
-
     /// Notes the truth's hash beside those of what the tool will get. To be called before the tool is started.
     pub fn seal(&self, id: &str, inputs: &[PathBuf]) -> Result<String> {
         let sealed = hash_file(&self.path(id))?;

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::{
-    process::{self, Taken},
+    program::{self, Taken},
     stats,
     table::Table,
 };
@@ -136,7 +136,7 @@ impl Tool {
             command.args(["--without", effect]);
         }
         command.args(["--out", out]);
-        let taken = process::run(&mut command, limit).context("twin explain")?;
+        let taken = program::run(&mut command, limit).context("twin explain")?;
         let report = folder.join(out).join("report.json");
         let text = fs::read_to_string(&report)
             .with_context(|| format!("reading {}", report.display()))?;
@@ -166,7 +166,7 @@ impl Tool {
             if two_clocks {
                 command.args(["--reference", "holdout-reference.csv"]);
             }
-            process::run(&mut command, limit).context("twin simulate")?;
+            program::run(&mut command, limit).context("twin simulate")?;
             simulated.push(Table::read(&kept.join(out))?);
             fs::remove_file(kept.join(out))?;
         }
