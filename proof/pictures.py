@@ -18,8 +18,8 @@ INK, GREY = "#222222", "#999999"
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
 """Okabe and Ito's palette."""
 METHOD_MARKS = {
-    "straight-line": ("s", ORANGE), "bic": ("^", RED), "bic-ar1": ("v", PURPLE), "sindy": ("D", GREEN), "pysindy": ("D", GREEN),
-    "gp": ("P", SKY), "gaussian-process": ("P", SKY), "all-effects": ("X", GREY), "pybop": ("*", INK),
+    "straight-line": ("s", ORANGE), "bic": ("^", RED), "bic-ar1": ("v", PURPLE), "pysindy": ("D", GREEN),
+    "gaussian-process": ("P", SKY), "all-at-once": ("X", GREY), "pybop": ("*", INK),
 }
 KINDS = {"a": "(a) real", "b": "(b) others' simulators", "c": "(c) others' solver", "d": "(d) our own"}
 OUTCOMES = [

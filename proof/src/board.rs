@@ -18,8 +18,8 @@ use crate::{
     table::Table,
 };
 
-/// For a drive of a minute and a half.
-const LIMIT: Duration = Duration::from_secs(400);
+/// Processor time for a drive of a minute and a half.
+const LIMIT: Duration = Duration::from_secs(120);
 /// US06 of a 2.9 Ah cell; P. Kollmeyer, see recordings/panasonic-18650pf/README.md.
 const DRIVE: &str = "recordings/panasonic-18650pf/25c-us06.csv";
 /// To the −144 … 396 A of a vehicle.
@@ -183,7 +183,12 @@ impl Board {
     }
 
     /// Writes the tool's calibration to the board and drives the held-out piece again.
-    pub fn calibrated(&self, root: &Path, planned: &Planned, folders: &Folders) -> Result<Option<Calibrated>> {
+    pub fn calibrated(
+        &self,
+        root: &Path,
+        planned: &Planned,
+        folders: &Folders,
+    ) -> Result<Option<Calibrated>> {
         let calibration = folders.given.join("out/calibration.toml");
         if !calibration.exists() {
             return Ok(None);
@@ -217,12 +222,14 @@ fn errors(log: &Table) -> Result<(f64, f64)> {
     )
     .context("the log has no current")?;
     let (truth, said) = (log.column("q_ref_c")?, log.column("q_meas_c")?);
-    let mut difference = truth
+    let difference: Vec<f64> = truth
         .iter()
         .zip(said)
         .map(|(truth, said)| said - truth)
-        .filter(|error| error.is_finite());
-    let first = difference.next().context("the log has no charge")?;
-    let last = difference.last().unwrap_or(first);
-    Ok((current, last - first))
+        .filter(|error| error.is_finite())
+        .collect();
+    match difference.as_slice() {
+        [first, .., last] => Ok((current, last - first)),
+        _ => bail!("the log has no charge"),
+    }
 }

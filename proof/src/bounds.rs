@@ -21,17 +21,23 @@ pub fn broken(summary: &Summary, records: &[Record]) -> Vec<String> {
     }
     for record in records {
         if record.truth.is_some() && record.truth_sha256.len() != 64 {
-            broken.push(format!("{}: the truth was not sealed", record.planned.case.id));
+            broken.push(format!(
+                "{}: the truth was not sealed",
+                record.planned.case.id
+            ));
         }
     }
     if summary.same != Some(true) {
-        broken.push("the same input gave two different reports, or no case was run twice".to_owned());
+        broken
+            .push("the same input gave two different reports, or no case was run twice".to_owned());
     }
     let scored = summary
         .by_kind
         .iter()
         .map(|kind| kind.confidently_wrong)
-        .fold((0, 0), |(count, of), share| (count + share.count, of + share.of));
+        .fold((0, 0), |(count, of), share| {
+            (count + share.count, of + share.of)
+        });
     if scored.1 == 0 || scored.0 as f64 > CONFIDENTLY_WRONG * scored.1 as f64 {
         broken.push(format!(
             "confidently wrong in {} of {}, allowed {:.0} %",
@@ -57,7 +63,9 @@ pub fn broken(summary: &Summary, records: &[Record]) -> Vec<String> {
         .by_kind
         .iter()
         .map(|kind| kind.right)
-        .fold((0, 0), |(count, of), share| (count + share.count, of + share.of));
+        .fold((0, 0), |(count, of), share| {
+            (count + share.count, of + share.of)
+        });
     if right.1 == 0 || (right.0 as f64) < RIGHT * right.1 as f64 {
         broken.push(format!(
             "right in {} of {}, wanted {:.0} %",
@@ -72,7 +80,10 @@ pub fn broken(summary: &Summary, records: &[Record]) -> Vec<String> {
         .filter(|line| line.standing == "published" && line.outcome == Outcome::Missed)
         .collect();
     for line in published {
-        broken.push(format!("{}: nothing was found in a real recording", line.id));
+        broken.push(format!(
+            "{}: nothing was found in a real recording",
+            line.id
+        ));
     }
     broken
 }

@@ -49,7 +49,7 @@ enum Command {
     #[command(
         after_help = "Example:\n  cargo xtask prove --quick     builds what is needed and calls this"
     )]
-    Run(Run),
+    Run(Box<Run>),
     /// List the cases
     List {
         /// How much of the campaign
@@ -130,9 +130,8 @@ fn main() -> ExitCode {
 }
 
 fn run(arguments: &Run) -> Result<bool> {
-    let absolute = |path: &PathBuf| {
-        std::path::absolute(path).with_context(|| path.display().to_string())
-    };
+    let absolute =
+        |path: &PathBuf| std::path::absolute(path).with_context(|| path.display().to_string());
     let root = absolute(&arguments.root)?;
     let real = real::expected(&root.join("proof/expected.toml"))?;
     let mut plan = plan::plan(arguments.plan, &real);
@@ -216,7 +215,10 @@ fn run(arguments: &Run) -> Result<bool> {
             Some(false) => "MISSED",
             None => "",
         };
-        println!("{:<6} {}: {} (wanted {})", met, target.what, target.found, target.wanted);
+        println!(
+            "{:<6} {}: {} (wanted {})",
+            met, target.what, target.found, target.wanted
+        );
     }
     println!("{}", pages.join("index.md").display());
     if arguments.plan == Extent::Full || arguments.only.is_some() {

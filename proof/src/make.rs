@@ -15,8 +15,8 @@ use crate::{
     seal::{Safe, hash, hash_file},
 };
 
-/// For one case; a batch has as much for each of its cases.
-const LIMIT: Duration = Duration::from_secs(180);
+/// Processor time for one case; a batch has as much for each of its cases.
+const LIMIT: Duration = Duration::from_secs(120);
 
 /// Where a case's files are.
 #[derive(Debug, Clone)]
@@ -168,7 +168,10 @@ pub fn hash_of_sources(folder: &Path) -> Result<String> {
         .collect::<std::io::Result<Vec<_>>>()?
         .into_iter()
         .map(|entry| entry.path())
-        .filter(|path| path.extension().is_some_and(|ending| ending == "py" || ending == "cir"))
+        .filter(|path| {
+            path.extension()
+                .is_some_and(|ending| ending == "py" || ending == "cir")
+        })
         .collect();
     files.sort();
     let mut all = String::new();

@@ -15,8 +15,8 @@ use crate::{
     program,
 };
 
-/// For one recording.
-const LIMIT: Duration = Duration::from_secs(300);
+/// Processor time for one recording: many times what the slowest explanation takes.
+const LIMIT: Duration = Duration::from_secs(120);
 
 /// What a method found (proof/methods/run.py).
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -90,7 +90,8 @@ impl Methods {
             .arg(&out);
         one_thread(&mut command);
         program::run(&mut command, LIMIT)?;
-        let text = fs::read_to_string(&out).with_context(|| format!("reading {}", out.display()))?;
+        let text =
+            fs::read_to_string(&out).with_context(|| format!("reading {}", out.display()))?;
         serde_json::from_str(&text).with_context(|| format!("reading {}", out.display()))
     }
 

@@ -105,7 +105,12 @@ pub fn write(summary: &Summary, folder: &Path) -> Result<()> {
     Ok(())
 }
 
-fn counts_table(text: &mut String, lines: &[&Counts], first: &str, title: impl Fn(&Counts) -> String) {
+fn counts_table(
+    text: &mut String,
+    lines: &[&Counts],
+    first: &str,
+    title: impl Fn(&Counts) -> String,
+) {
     let used: Vec<&(Outcome, &str)> = OUTCOMES
         .iter()
         .filter(|(one, _)| lines.iter().any(|line| line.outcomes.contains_key(one)))
@@ -122,7 +127,12 @@ fn counts_table(text: &mut String, lines: &[&Counts], first: &str, title: impl F
         for (one, _) in &used {
             let _ = write!(text, " {} |", line.outcomes.get(one).copied().unwrap_or(0));
         }
-        let _ = writeln!(text, " {} | {} |", short(&line.right), short(&line.confidently_wrong));
+        let _ = writeln!(
+            text,
+            " {} | {} |",
+            short(&line.right),
+            short(&line.confidently_wrong)
+        );
     }
     text.push('\n');
 }
@@ -157,20 +167,31 @@ fn index(summary: &Summary, folder: &Path) -> String {
          - Shares carry Wilson's 95 % interval. *just visible* (strength 1): the effect moves the reading by 0.3 of the noise's rms.\n\n",
     );
 
-    text.push_str("## Against what was wanted\n\n| figure | wanted | found | |\n|---|---|---|---|\n");
+    text.push_str(
+        "## Against what was wanted\n\n| figure | wanted | found | |\n|---|---|---|---|\n",
+    );
     for target in &summary.targets {
         let met = match target.met {
             Some(true) => "met",
             Some(false) => "**MISSED**",
             None => "not measured",
         };
-        let _ = writeln!(text, "| {} | {} | {} | {met} |", target.what, target.wanted, target.found);
+        let _ = writeln!(
+            text,
+            "| {} | {} | {} | {met} |",
+            target.what, target.wanted, target.found
+        );
     }
     text.push('\n');
 
     text.push_str("## Real recordings (a)\n\nWhat is right was [written down](../../proof/expected.toml) from what the publishers measured before the campaign ran. \
         Held out: rms on a file or piece that was never fitted.\n\n");
-    picture(&mut text, folder, "real.svg", "Held-out error on each real recording: as designed, twin, today's methods");
+    picture(
+        &mut text,
+        folder,
+        "real.svg",
+        "Held-out error on each real recording: as designed, twin, today's methods",
+    );
     real_table(&mut text, &summary.real);
 
     let others: Vec<&Counts> = summary
@@ -180,28 +201,56 @@ fn index(summary: &Summary, folder: &Path) -> String {
         .collect();
     if !others.is_empty() {
         text.push_str("## Simulators that others wrote (b)\n\n");
-        picture(&mut text, folder, "others.svg", "What was hidden in the data of other people's simulators, and what was said");
+        picture(
+            &mut text,
+            folder,
+            "others.svg",
+            "What was hidden in the data of other people's simulators, and what was said",
+        );
         counts_table(&mut text, &others, "made by", |line| line.name.clone());
         confusion_table(&mut text, &summary.confusion, "b");
     }
 
     text.push_str("## Nothing concealed: false alarms\n\n");
-    picture(&mut text, folder, "false-alarms.svg", "Share of clean recordings in which something is named, by twin and by today's methods");
-    text.push_str("| data | an effect named | anything but \"no mismatch\" said |\n|---|---|---|\n");
+    picture(
+        &mut text,
+        folder,
+        "false-alarms.svg",
+        "Share of clean recordings in which something is named, by twin and by today's methods",
+    );
+    text.push_str(
+        "| data | an effect named | anything but \"no mismatch\" said |\n|---|---|---|\n",
+    );
     for line in &summary.clean {
-        let _ = writeln!(text, "| {} | {} | {} |", kind_title(&line.kind), shown(&line.named), shown(&line.anything));
+        let _ = writeln!(
+            text,
+            "| {} | {} | {} |",
+            kind_title(&line.kind),
+            shown(&line.named),
+            shown(&line.anything)
+        );
     }
     text.push('\n');
 
     if !summary.methods.is_empty() {
         text.push_str("## Beside what people use today\n\nThe same files, the same held-out data, judged by the same rule; twin on those cases only. \
             Processor time, without the start of a program.\n\n");
-        picture(&mut text, folder, "methods.svg", "Right names and time, twin and today's methods");
+        picture(
+            &mut text,
+            folder,
+            "methods.svg",
+            "Right names and time, twin and today's methods",
+        );
         methods_table(&mut text, summary);
     }
 
     text.push_str("## One concealed effect, by its strength (d)\n\nOur own generator: it shows where the tool begins to see an effect, not that it would in nature.\n\n");
-    picture(&mut text, folder, "detection.svg", "Share of right answers of each effect over its strength");
+    picture(
+        &mut text,
+        folder,
+        "detection.svg",
+        "Share of right answers of each effect over its strength",
+    );
     if let Some((cases, median, most, within)) = &summary.over_oracle {
         let _ = writeln!(
             text,
@@ -211,7 +260,12 @@ fn index(summary: &Summary, folder: &Path) -> String {
             shown(within)
         );
     }
-    picture(&mut text, folder, "coverage.svg", "Share of 95 % intervals that have the truth in them, by effect");
+    picture(
+        &mut text,
+        folder,
+        "coverage.svg",
+        "Share of 95 % intervals that have the truth in them, by effect",
+    );
     if let Some((cases, low, middle, high)) = summary.overlap {
         let _ = writeln!(
             text,
@@ -227,7 +281,12 @@ fn index(summary: &Summary, folder: &Path) -> String {
     }
 
     text.push_str("## The emulated board (our emulator, the unmodified image)\n\n");
-    picture(&mut text, folder, "board.svg", "Error of the board's current before and after the calibration");
+    picture(
+        &mut text,
+        folder,
+        "board.svg",
+        "Error of the board's current before and after the calibration",
+    );
     board_table(&mut text, summary);
 
     text.push_str("## Misses\n\n");
@@ -254,7 +313,9 @@ fn real_table(text: &mut String, lines: &[RealLine]) {
             .filter(|(_, found)| found.error.is_none())
             .filter_map(|(name, found)| Some((name, found.held_out_rms?)))
             .min_by(|a, b| a.1.total_cmp(&b.1))
-            .map_or("–".to_owned(), |(name, rms)| format!("{} ({name})", number(rms)));
+            .map_or("–".to_owned(), |(name, rms)| {
+                format!("{} ({name})", number(rms))
+            });
         let mut judged = outcome(line.outcome).to_owned();
         if line.confident {
             judged = format!("**{judged}**, confidently");
@@ -266,7 +327,11 @@ fn real_table(text: &mut String, lines: &[RealLine]) {
             text,
             "| {} | {} | {by} | {}: {} | {judged} | {} → {} | {best} |",
             line.id,
-            if line.required.is_empty() { "–".to_owned() } else { required(&line.required) },
+            if line.required.is_empty() {
+                "–".to_owned()
+            } else {
+                required(&line.required)
+            },
             line.verdict,
             names(&line.named),
             maybe(line.before),
@@ -284,7 +349,9 @@ fn real_table(text: &mut String, lines: &[RealLine]) {
     text.push_str("| recording | parameter | published | counts as right | said, with 95 % interval | |\n|---|---|---|---|---|---|\n");
     for (line, one) in published {
         let said = match (one.said, one.interval) {
-            (Some(value), Some((low, high))) => format!("{} ({} … {})", number(value), number(low), number(high)),
+            (Some(value), Some((low, high))) => {
+                format!("{} ({} … {})", number(value), number(low), number(high))
+            }
             (Some(value), None) => number(value),
             (None, _) => "not named".to_owned(),
         };
@@ -310,7 +377,11 @@ fn methods_table(text: &mut String, summary: &Summary) {
     text.push_str("| method | cases | right | wrong | false alarms | held out over the true model, median | processor time, median | failed |\n|---|---|---|---|---|---|---|---|\n");
     for line in &summary.methods {
         let right = if line.names_effects || line.name == "twin" {
-            (short(&line.right), short(&line.wrong), short(&line.false_alarms))
+            (
+                short(&line.right),
+                short(&line.wrong),
+                short(&line.false_alarms),
+            )
         } else {
             ("names none".to_owned(), "–".to_owned(), "–".to_owned())
         };
@@ -340,9 +411,18 @@ fn board_table(text: &mut String, summary: &Summary) {
         let (current, charge) = match &line.calibrated {
             Some(one) => (
                 format!("{} → {} A", number(one.before_a), number(one.after_a)),
-                format!("{} → {} C", number(one.charge_before_c), number(one.charge_after_c)),
+                format!(
+                    "{} → {} C",
+                    number(one.charge_before_c),
+                    number(one.charge_after_c)
+                ),
             ),
-            None => (line.error.clone().unwrap_or("no calibration was written".to_owned()), "–".to_owned()),
+            None => (
+                line.error
+                    .clone()
+                    .unwrap_or("no calibration was written".to_owned()),
+                "–".to_owned(),
+            ),
         };
         let _ = writeln!(
             text,
@@ -356,11 +436,22 @@ fn board_table(text: &mut String, summary: &Summary) {
 }
 
 fn misses(text: &mut String, summary: &Summary) {
-    for target in summary.targets.iter().filter(|target| target.met == Some(false)) {
-        let _ = writeln!(text, "- {}: {}, wanted {}", target.what, target.found, target.wanted);
+    for target in summary
+        .targets
+        .iter()
+        .filter(|target| target.met == Some(false))
+    {
+        let _ = writeln!(
+            text,
+            "- {}: {}, wanted {}",
+            target.what, target.found, target.wanted
+        );
     }
     for line in &summary.real {
-        if matches!(line.outcome, Outcome::Wrong | Outcome::Missed | Outcome::Error | Outcome::Part | Outcome::Unknown) {
+        if matches!(
+            line.outcome,
+            Outcome::Wrong | Outcome::Missed | Outcome::Error | Outcome::Part | Outcome::Unknown
+        ) {
             let _ = writeln!(
                 text,
                 "- {}: {} (right: {}; said: {})",
@@ -384,10 +475,18 @@ fn misses(text: &mut String, summary: &Summary) {
         })
         .collect();
     if !weak.is_empty() {
-        let _ = writeln!(text, "- single effects that are not right in 95 % at three times the just visible strength (d): {}", weak.join(", "));
+        let _ = writeln!(
+            text,
+            "- single effects that are not right in 95 % at three times the just visible strength (d): {}",
+            weak.join(", ")
+        );
     }
     if !summary.errors.is_empty() {
-        let _ = writeln!(text, "- failed: {} cases ([tables](tables.md))", summary.errors.len());
+        let _ = writeln!(
+            text,
+            "- failed: {} cases ([tables](tables.md))",
+            summary.errors.len()
+        );
     }
 }
 
@@ -405,14 +504,21 @@ fn confusion_table(text: &mut String, lines: &[Confusion], kind: &str) {
     text.push('\n');
     for line in lines {
         let count = |word: &str| line.said.get(word).copied().unwrap_or(0);
-        let _ = write!(text, "| {} | {} |", line.effect, count(&line.effect) + count("exact"));
+        let _ = write!(
+            text,
+            "| {} | {} |",
+            line.effect,
+            count(&line.effect) + count("exact")
+        );
         for word in NO_NAMES {
             let _ = write!(text, " {} |", count(word));
         }
         let others: Vec<String> = line
             .said
             .iter()
-            .filter(|(word, _)| **word != line.effect && !NO_NAMES.contains(&word.as_str()) && *word != "exact")
+            .filter(|(word, _)| {
+                **word != line.effect && !NO_NAMES.contains(&word.as_str()) && *word != "exact"
+            })
             .map(|(word, count)| format!("{word} {count}"))
             .collect();
         let _ = writeln!(text, " {} |", others.join(", "));
@@ -421,7 +527,9 @@ fn confusion_table(text: &mut String, lines: &[Confusion], kind: &str) {
 }
 
 fn tables(summary: &Summary) -> String {
-    let mut text = String::from("# Tables of the campaign\n\n[What they mean](index.md), [how they come about](method.md).\n\n");
+    let mut text = String::from(
+        "# Tables of the campaign\n\n[What they mean](index.md), [how they come about](method.md).\n\n",
+    );
     text.push_str("## By who made the data\n\n");
     let mut kinds: Vec<&Counts> = summary.by_kind.iter().collect();
     kinds.push(&summary.others_together);
@@ -433,10 +541,20 @@ fn tables(summary: &Summary) -> String {
         }
     });
     for line in &summary.by_kind {
-        let _ = writeln!(text, "- {}: {}", kind_title(&line.name), line.makers.join("; "));
+        let _ = writeln!(
+            text,
+            "- {}: {}",
+            kind_title(&line.name),
+            line.makers.join("; ")
+        );
     }
     text.push_str("\n## By what the cases are for\n\n");
-    counts_table(&mut text, &summary.by_group.iter().collect::<Vec<_>>(), "cases", |line| line.name.clone());
+    counts_table(
+        &mut text,
+        &summary.by_group.iter().collect::<Vec<_>>(),
+        "cases",
+        |line| line.name.clone(),
+    );
     for kind in ["b", "c", "d"] {
         if summary.confusion.iter().any(|line| line.kind == kind) {
             let _ = writeln!(text, "## Confusion, {}\n", kind_title(kind));
@@ -454,14 +572,18 @@ fn tables(summary: &Summary) -> String {
             "| {} | ({}) | {} |",
             line.effect,
             line.kind,
-            line.limit.map_or("none".to_owned(), |limit| limit.to_string())
+            line.limit
+                .map_or("none".to_owned(), |limit| limit.to_string())
         );
         for strength in crate::plan::STRENGTHS {
             let share = line.strengths.iter().find(|(one, _)| *one == strength);
             let _ = write!(
                 text,
                 " {} |",
-                share.map_or("–".to_owned(), |(_, share)| format!("{}/{}", share.count, share.of))
+                share.map_or("–".to_owned(), |(_, share)| format!(
+                    "{}/{}",
+                    share.count, share.of
+                ))
             );
         }
         text.push('\n');
@@ -474,7 +596,8 @@ fn tables(summary: &Summary) -> String {
             line.effect,
             line.name,
             line.cases,
-            line.median_error.map_or("–".to_owned(), |error| format!("{:.1} %", 100.0 * error)),
+            line.median_error
+                .map_or("–".to_owned(), |error| format!("{:.1} %", 100.0 * error)),
             shown(&line.covered)
         );
     }
@@ -496,7 +619,9 @@ fn tables(summary: &Summary) -> String {
         .filter(|line| line.outcome == Some(Outcome::Wrong))
         .collect();
     if !bad.is_empty() {
-        text.push_str("\n## Every wrong answer\n\n| case | data | hidden | said | |\n|---|---|---|---|---|\n");
+        text.push_str(
+            "\n## Every wrong answer\n\n| case | data | hidden | said | |\n|---|---|---|---|---|\n",
+        );
         for line in bad {
             let _ = writeln!(
                 text,

@@ -96,9 +96,9 @@ pub const METHODS: [&str; 7] = [
     "straight-line",
     "bic",
     "bic-ar1",
-    "sindy",
-    "gp",
-    "all-effects",
+    "pysindy",
+    "gaussian-process",
+    "all-at-once",
     "pybop",
 ];
 
@@ -253,7 +253,8 @@ fn single(maker: &str, effects: &[&str], rows: usize) -> Vec<Planned> {
                     if strength == 10.0 && noise == "white" && place == 0 {
                         planned.methods = all_methods();
                     }
-                    planned.twice = *effect == "lag" && strength == 10.0 && noise == "white" && place == 0;
+                    planned.twice =
+                        *effect == "lag" && strength == 10.0 && noise == "white" && place == 0;
                     plan.push(planned);
                 }
             }
@@ -391,14 +392,22 @@ fn is_quick(planned: &Planned) -> bool {
     let case = &planned.case;
     let usual = case.noise == "white" && case.drive == "us06" && case.seed == 1;
     match planned.group {
-        Group::Real => ["gpu-rtx3090", "gpu-a100", "gpu-k40m", "nasa-b0053", "bh-ferrite"]
-            .contains(&case.drive.as_str()),
+        Group::Real => [
+            "gpu-rtx3090",
+            "gpu-a100",
+            "gpu-k40m",
+            "nasa-b0053",
+            "bh-ferrite",
+        ]
+        .contains(&case.drive.as_str()),
         Group::Single => usual && case.strength() == 10.0,
         Group::Clean => case.seed <= 1,
         Group::Outside => usual && case.strength() == 10.0,
-        Group::Combined => usual && case.strength() == 10.0 && case.effects.len() == 2 && {
-            ["offset", "lag"].contains(&case.effects[0].id.as_str())
-        },
+        Group::Combined => {
+            usual && case.strength() == 10.0 && case.effects.len() == 2 && {
+                ["offset", "lag"].contains(&case.effects[0].id.as_str())
+            }
+        }
         Group::Inseparable => case.drive == "us06" && case.effects[0].id.starts_with("offset"),
         Group::Cells | Group::Circuits | Group::Board => case.options.contains_key("quick"),
     }
@@ -411,12 +420,19 @@ pub fn plan(extent: Extent, real: &[Expected]) -> Vec<Planned> {
         plan.retain(is_quick);
         for planned in &mut plan {
             // Each method on a few; it is the tool that is tested here.
-            let few = planned.group == Group::Real || planned.case.effects.iter().any(|effect| effect.id == "lag");
+            let few = planned.group == Group::Real
+                || planned.case.effects.iter().any(|effect| effect.id == "lag");
             if !few {
                 planned.methods.clear();
             }
-            planned.methods.retain(|name| ["straight-line", "bic"].contains(&name.as_str()));
-            planned.without &= planned.case.effects.iter().any(|effect| ["lag", "gain"].contains(&effect.id.as_str()));
+            planned
+                .methods
+                .retain(|name| ["straight-line", "bic"].contains(&name.as_str()));
+            planned.without &= planned
+                .case
+                .effects
+                .iter()
+                .any(|effect| ["lag", "gain"].contains(&effect.id.as_str()));
         }
     }
     plan
@@ -442,7 +458,8 @@ mod tests {
         assert_eq!(ids.len(), plan.len());
         for id in ids {
             assert!(
-                id.chars().all(|c| c.is_ascii_alphanumeric() || "-_.".contains(c)),
+                id.chars()
+                    .all(|c| c.is_ascii_alphanumeric() || "-_.".contains(c)),
                 "{id}"
             );
         }
@@ -456,13 +473,19 @@ mod tests {
                 .iter()
                 .filter(|one| one.group == Group::Single && one.case.effects[0].id == *effect)
                 .count();
-            assert!(of_it >= STRENGTHS.len() * NOISES.len() * DRIVES.len(), "{effect}");
+            assert!(
+                of_it >= STRENGTHS.len() * NOISES.len() * DRIVES.len(),
+                "{effect}"
+            );
         }
     }
 
     #[test]
     fn the_quick_campaign_is_a_small_part_of_the_full_one() {
-        let full: HashSet<String> = plan(Extent::Full, &real()).into_iter().map(|one| one.case.id).collect();
+        let full: HashSet<String> = plan(Extent::Full, &real())
+            .into_iter()
+            .map(|one| one.case.id)
+            .collect();
         let quick = plan(Extent::Quick, &real());
         assert!((30..=80).contains(&quick.len()), "{}", quick.len());
         assert!(quick.iter().all(|one| full.contains(&one.case.id)));

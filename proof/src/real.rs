@@ -157,7 +157,9 @@ impl Expected {
         let tip = |values: &[f64]| {
             let of_it = || (0..values.len()).filter(|row| number[*row] == largest);
             let low = of_it().map(|row| values[row]).fold(f64::INFINITY, f64::min);
-            let high = of_it().map(|row| values[row]).fold(f64::NEG_INFINITY, f64::max);
+            let high = of_it()
+                .map(|row| values[row])
+                .fold(f64::NEG_INFINITY, f64::max);
             high - low
         };
         let slope = tip(flux) / tip(field);
@@ -180,7 +182,10 @@ impl Expected {
             let mut table = Table::default();
             table.push("t_s", t_s);
             table.push("cycle", rows.iter().map(|row| number[*row]).collect());
-            table.push("h_ref_a_per_m", rows.iter().map(|row| field[*row]).collect());
+            table.push(
+                "h_ref_a_per_m",
+                rows.iter().map(|row| field[*row]).collect(),
+            );
             table.push(
                 "h_meas_a_per_m",
                 rows.iter().map(|row| flux[*row] / slope).collect(),
@@ -219,7 +224,7 @@ fn copy_model(model: &Path, given: &Path) -> Result<()> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
+    #![allow(clippy::unwrap_used, clippy::panic)]
 
     use super::*;
 
@@ -241,7 +246,12 @@ mod tests {
             let fitted = Table::read(&given.join("recording.csv")).unwrap();
             let held = Table::read(&kept.join("holdout.csv")).unwrap();
             assert!(fitted.len() > 200 && held.len() > 100, "{}", case.id);
-            assert_eq!(case.truth != "none", !case.required.is_empty(), "{}", case.id);
+            assert_eq!(
+                case.truth != "none",
+                !case.required.is_empty(),
+                "{}",
+                case.id
+            );
         }
     }
 

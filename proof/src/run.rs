@@ -29,10 +29,10 @@ use crate::{
     tool::{Given, Said, Tool},
 };
 
-/// For one explanation of a made case.
-const LIMIT: Duration = Duration::from_secs(120);
-/// Of a real recording, which may have 48,000 rows, on a machine that does something else beside.
-const LIMIT_REAL: Duration = Duration::from_secs(600);
+/// Processor time for one explanation of a made case.
+const LIMIT: Duration = Duration::from_secs(60);
+/// Of a real recording, which may have 48,000 rows.
+const LIMIT_REAL: Duration = Duration::from_secs(200);
 /// Cases that one process of the makers makes: starting Python and its libraries takes seconds.
 const BATCH: usize = 10;
 
@@ -170,7 +170,11 @@ impl Campaign {
             }
         }
         if !records.is_empty() {
-            eprintln!("{} of {} cases are there from an earlier run", records.len(), plan.len());
+            eprintln!(
+                "{} of {} cases are there from an earlier run",
+                records.len(),
+                plan.len()
+            );
         }
         let progress = Progress {
             done: AtomicUsize::new(0),
@@ -248,9 +252,9 @@ impl Campaign {
             fs::write(&part, serde_json::to_string(&record)?)?;
             fs::rename(&part, &path)?;
             progress.tell(&record);
-            let right = record
-                .judgement()
-                .is_none_or(|judged| judged.outcome.right() || judged.outcome == score::Outcome::Quiet);
+            let right = record.judgement().is_none_or(|judged| {
+                judged.outcome.right() || judged.outcome == score::Outcome::Quiet
+            });
             if right && !self.keep {
                 let folder = Folders::new(&self.out, &planned.case.id).case;
                 fs::remove_dir_all(&folder)
@@ -288,7 +292,13 @@ impl Campaign {
     }
 
     /// Seals, explains, holds out, compares, opens.
-    fn case(&self, planned: &Planned, key: &str, not_made: Option<String>, safe: &Safe) -> Result<Record> {
+    fn case(
+        &self,
+        planned: &Planned,
+        key: &str,
+        not_made: Option<String>,
+        safe: &Safe,
+    ) -> Result<Record> {
         let id = &planned.case.id;
         let mut record = Record {
             key: key.to_owned(),
@@ -331,26 +341,42 @@ impl Campaign {
         if let Some(said) = &mut record.said {
             let found = folders.given.join("out/model.toml");
             let designed = folders.given.join("model.toml");
-            match self.tool.held_out(&folders.kept, &absolute(&designed)?, &absolute(&found)?, given.two_clocks, limit) {
+            match self.tool.held_out(
+                &folders.kept,
+                &absolute(&designed)?,
+                &absolute(&found)?,
+                given.two_clocks,
+                limit,
+            ) {
                 Ok(errors) => said.held_out = errors,
                 Err(error) => record.error = Some(format!("held out: {error:#}")),
             }
         }
         for method in &planned.methods {
             if self.methods.there() {
-                record.methods.insert(method.clone(), self.methods.run(method, &folders));
+                record
+                    .methods
+                    .insert(method.clone(), self.methods.run(method, &folders));
             }
         }
 
         let opened = safe.unseal(id, &record.truth_sha256)?;
-        let truth: Truth = serde_json::from_str(&opened).with_context(|| format!("the truth of {id}"))?;
+        let truth: Truth =
+            serde_json::from_str(&opened).with_context(|| format!("the truth of {id}"))?;
         if planned.without {
-            record.removed = truth.effects.iter().map(|effect| effect.id.clone()).collect();
+            record.removed = truth
+                .effects
+                .iter()
+                .map(|effect| effect.id.clone())
+                .collect();
             let given = Given {
                 without: record.removed.clone(),
                 ..given
             };
-            record.without = self.tool.explain(&folders.given, "without", &given, limit).ok();
+            record.without = self
+                .tool
+                .explain(&folders.given, "without", &given, limit)
+                .ok();
         }
         if let (Some(place), Some(said)) = (&truth.place, &record.said) {
             let recording = Table::read(&folders.given.join("recording.csv"))?;

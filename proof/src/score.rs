@@ -83,7 +83,9 @@ pub fn judge(truth: &Truth, strength: f64, removed: &[String], said: Option<&Sai
     if truth.unknown() {
         return judgement(Outcome::Unscored, false, "unscored");
     }
-    let is_true = |id: &String| truth.allowed.contains(id) || truth.required.iter().flatten().any(|one| one == id);
+    let is_true = |id: &String| {
+        truth.allowed.contains(id) || truth.required.iter().flatten().any(|one| one == id)
+    };
     let acceptable = |named: &Named| is_true(&named.id) || named.equals.iter().any(is_true);
     if let Some(wrong) = said.named.iter().find(|named| !acceptable(named)) {
         let confident = matches!(said.verdict.as_str(), "explained" | "partly-explained");
@@ -116,14 +118,18 @@ pub fn judge(truth: &Truth, strength: f64, removed: &[String], said: Option<&Sai
         })
     };
     let within = |list: &Vec<String>| {
-        said.named
-            .iter()
-            .any(|named| list.contains(&named.id) || named.equals.iter().any(|other| list.contains(other)))
+        said.named.iter().any(|named| {
+            list.contains(&named.id) || named.equals.iter().any(|other| list.contains(other))
+        })
     };
     let found = wanted.iter().filter(|list| within(list)).count();
     if found == wanted.len() {
         return if wanted.iter().all(|list| exact(list)) {
-            let id = if wanted.len() == 1 { wanted[0].first() } else { None };
+            let id = if wanted.len() == 1 {
+                wanted[0].first()
+            } else {
+                None
+            };
             judgement(Outcome::Exact, false, id.map_or("exact", String::as_str))
         } else {
             judgement(Outcome::Class, false, "class")
@@ -171,15 +177,16 @@ fn covers(reported: &Parameter, truth: f64) -> Option<bool> {
 /// Samples in both places over samples in either, for the best of the reported regions. Nothing if the truth has no place.
 pub fn overlap(place: &Place, locations: &[Location], recording: &Table) -> Option<f64> {
     let column = recording.get(&place.column)?;
-    let inside = |values: &[f64], absolute: bool, from: Option<f64>, to: Option<f64>| -> Vec<bool> {
-        values
-            .iter()
-            .map(|value| {
-                let value = if absolute { value.abs() } else { *value };
-                from.is_none_or(|from| value >= from) && to.is_none_or(|to| value <= to)
-            })
-            .collect()
-    };
+    let inside =
+        |values: &[f64], absolute: bool, from: Option<f64>, to: Option<f64>| -> Vec<bool> {
+            values
+                .iter()
+                .map(|value| {
+                    let value = if absolute { value.abs() } else { *value };
+                    from.is_none_or(|from| value >= from) && to.is_none_or(|to| value <= to)
+                })
+                .collect()
+        };
     let truth = inside(column, place.absolute, place.from, place.to);
     let reference = if recording.get("i_ref_a").is_some() {
         "i_ref_a"
@@ -249,7 +256,10 @@ mod tests {
     #[test]
     fn the_right_name_alone_is_exact() {
         let truth = hidden(&[&["lag"]], &["offset"]);
-        assert_eq!(outcome(&truth, 10.0, &said("explained", &[("lag", &[])])), Outcome::Exact);
+        assert_eq!(
+            outcome(&truth, 10.0, &said("explained", &[("lag", &[])])),
+            Outcome::Exact
+        );
         // What is true beside it does not spoil it.
         let both = said("explained", &[("offset", &[]), ("lag", &[])]);
         assert_eq!(outcome(&truth, 10.0, &both), Outcome::Exact);
@@ -260,7 +270,10 @@ mod tests {
     fn a_class_with_the_right_name_is_a_class() {
         let truth = hidden(&[&["lag"]], &[]);
         for named in [("lag", &["delay"][..]), ("delay", &["lag"][..])] {
-            assert_eq!(outcome(&truth, 10.0, &said("ambiguous", &[named])), Outcome::Class);
+            assert_eq!(
+                outcome(&truth, 10.0, &said("ambiguous", &[named])),
+                Outcome::Class
+            );
         }
         // Two names that are as right as each other are no doubt.
         let either = hidden(&[&["offset", "offset-temperature"]], &[]);
@@ -273,16 +286,30 @@ mod tests {
         let truth = hidden(&[&["lag"]], &[]);
         let beside = said("explained", &[("lag", &[]), ("gain", &[])]);
         let judged = judge(&truth, 10.0, &[], Some(&beside));
-        assert_eq!((judged.outcome, judged.confident, judged.said.as_str()), (Outcome::Wrong, true, "gain"));
-        let unsure = judge(&truth, 10.0, &[], Some(&said("ambiguous", &[("gain", &["capacity"])])));
+        assert_eq!(
+            (judged.outcome, judged.confident, judged.said.as_str()),
+            (Outcome::Wrong, true, "gain")
+        );
+        let unsure = judge(
+            &truth,
+            10.0,
+            &[],
+            Some(&said("ambiguous", &[("gain", &["capacity"])])),
+        );
         assert_eq!((unsure.outcome, unsure.confident), (Outcome::Wrong, false));
     }
 
     #[test]
     fn of_two_hidden_effects_one_is_a_part() {
         let truth = hidden(&[&["lag"], &["gain"]], &["offset"]);
-        assert_eq!(outcome(&truth, 10.0, &said("partly-explained", &[("lag", &[])])), Outcome::Part);
-        assert_eq!(outcome(&truth, 10.0, &said("partly-explained", &[("offset", &[])])), Outcome::Part);
+        assert_eq!(
+            outcome(&truth, 10.0, &said("partly-explained", &[("lag", &[])])),
+            Outcome::Part
+        );
+        assert_eq!(
+            outcome(&truth, 10.0, &said("partly-explained", &[("offset", &[])])),
+            Outcome::Part
+        );
         let both = said("explained", &[("lag", &[]), ("gain", &[])]);
         assert_eq!(outcome(&truth, 10.0, &both), Outcome::Exact);
         let one_in_a_class = said("ambiguous", &[("lag", &[]), ("capacity", &["gain"])]);
@@ -295,16 +322,31 @@ mod tests {
         let quiet = said("no-mismatch", &[]);
         assert_eq!(outcome(&truth, 3.0, &quiet), Outcome::Missed);
         assert_eq!(outcome(&truth, 1.0, &quiet), Outcome::Silent);
-        assert_eq!(outcome(&truth, 1.0, &said("unknown", &[])), Outcome::Unknown);
-        assert_eq!(outcome(&truth, 30.0, &said("partly-explained", &[])), Outcome::Unknown);
+        assert_eq!(
+            outcome(&truth, 1.0, &said("unknown", &[])),
+            Outcome::Unknown
+        );
+        assert_eq!(
+            outcome(&truth, 30.0, &said("partly-explained", &[])),
+            Outcome::Unknown
+        );
     }
 
     #[test]
     fn with_nothing_hidden_only_quiet_is_right() {
         let clean = Truth::default();
-        assert_eq!(outcome(&clean, f64::INFINITY, &said("no-mismatch", &[])), Outcome::Quiet);
-        assert_eq!(outcome(&clean, f64::INFINITY, &said("unknown", &[])), Outcome::Unknown);
-        assert_eq!(outcome(&clean, f64::INFINITY, &said("explained", &[("gain", &[])])), Outcome::Wrong);
+        assert_eq!(
+            outcome(&clean, f64::INFINITY, &said("no-mismatch", &[])),
+            Outcome::Quiet
+        );
+        assert_eq!(
+            outcome(&clean, f64::INFINITY, &said("unknown", &[])),
+            Outcome::Unknown
+        );
+        assert_eq!(
+            outcome(&clean, f64::INFINITY, &said("explained", &[("gain", &[])])),
+            Outcome::Wrong
+        );
     }
 
     #[test]
@@ -314,10 +356,22 @@ mod tests {
             id: "creep".to_owned(),
             ..TrueEffect::default()
         }];
-        assert_eq!(outcome(&truth, 10.0, &said("unknown", &[])), Outcome::Unknown);
-        assert_eq!(outcome(&truth, 10.0, &said("explained", &[("lag", &[])])), Outcome::Wrong);
-        assert_eq!(outcome(&truth, 10.0, &said("explained", &[("offset", &[])])), Outcome::Class);
-        assert_eq!(outcome(&truth, 10.0, &said("no-mismatch", &[])), Outcome::Missed);
+        assert_eq!(
+            outcome(&truth, 10.0, &said("unknown", &[])),
+            Outcome::Unknown
+        );
+        assert_eq!(
+            outcome(&truth, 10.0, &said("explained", &[("lag", &[])])),
+            Outcome::Wrong
+        );
+        assert_eq!(
+            outcome(&truth, 10.0, &said("explained", &[("offset", &[])])),
+            Outcome::Class
+        );
+        assert_eq!(
+            outcome(&truth, 10.0, &said("no-mismatch", &[])),
+            Outcome::Missed
+        );
     }
 
     #[test]
@@ -339,13 +393,18 @@ mod tests {
             standing: Some("none".to_owned()),
             ..Truth::default()
         };
-        assert_eq!(outcome(&open, 1.0, &said("explained", &[("gain", &[])])), Outcome::Unscored);
+        assert_eq!(
+            outcome(&open, 1.0, &said("explained", &[("gain", &[])])),
+            Outcome::Unscored
+        );
     }
 
     #[test]
     fn intervals_are_compared_with_the_truth() {
         let mut truth = hidden(&[&["lag"]], &[]);
-        truth.effects[0].parameters.insert("tau_s".to_owned(), Some(0.1));
+        truth.effects[0]
+            .parameters
+            .insert("tau_s".to_owned(), Some(0.1));
         let mut report = said("explained", &[("lag", &[])]);
         report.named[0].parameters.push(Parameter {
             name: "tau_s".to_owned(),
@@ -378,7 +437,10 @@ mod tests {
                 energy_share: None,
             }]
         };
-        assert_eq!(overlap(&place, &said("abs(i)", 50.0), &recording), Some(1.0));
+        assert_eq!(
+            overlap(&place, &said("abs(i)", 50.0), &recording),
+            Some(1.0)
+        );
         assert_eq!(overlap(&place, &said("i", 50.0), &recording), Some(0.5));
         assert_eq!(overlap(&place, &[], &recording), Some(0.0));
     }

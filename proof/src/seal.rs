@@ -21,9 +21,9 @@ pub fn hash(bytes: &[u8]) -> String {
 
 /// Of a file.
 pub fn hash_file(path: &Path) -> Result<String> {
-    Ok(hash(&fs::read(path).with_context(|| {
-        format!("reading {}", path.display())
-    })?))
+    Ok(hash(
+        &fs::read(path).with_context(|| format!("reading {}", path.display()))?,
+    ))
 }
 
 /// Keeps truths away from the tool, and a log of what was sealed, started and opened, in that order.

@@ -32,8 +32,7 @@ impl Share {
         let (n, p) = (of as f64, count as f64 / of as f64);
         let square = Z_95 * Z_95;
         let middle = (p + square / (2.0 * n)) / (1.0 + square / n);
-        let half =
-            Z_95 / (1.0 + square / n) * (p * (1.0 - p) / n + square / (4.0 * n * n)).sqrt();
+        let half = Z_95 / (1.0 + square / n) * (p * (1.0 - p) / n + square / (4.0 * n * n)).sqrt();
         Self {
             count,
             of,

@@ -308,7 +308,11 @@ fn counts<'a>(name: &str, cases: impl Iterator<Item = (&'a Scored<'a>, Judgement
         *outcomes.entry(judged.outcome).or_insert(0) += 1;
         makers.insert(one.truth.maker.clone());
     }
-    let scored = || cases.iter().filter(|(_, judged)| judged.outcome != Outcome::Unscored);
+    let scored = || {
+        cases
+            .iter()
+            .filter(|(_, judged)| judged.outcome != Outcome::Unscored)
+    };
     Counts {
         name: name.to_owned(),
         makers: makers.into_iter().collect(),
@@ -419,7 +423,8 @@ fn confusion(scored: &[Scored<'_>]) -> Vec<Confusion> {
     let mut lines: BTreeMap<(String, String), BTreeMap<String, usize>> = BTreeMap::new();
     for one in scored {
         let case = &one.record.planned.case;
-        if case.effects.len() != 1 || !one.plain() || one.record.planned.group == Group::Inseparable {
+        if case.effects.len() != 1 || !one.plain() || one.record.planned.group == Group::Inseparable
+        {
             continue;
         }
         let line = lines
@@ -473,7 +478,9 @@ fn detection(scored: &[Scored<'_>]) -> Vec<Detection> {
 }
 
 /// Estimates of cases that were named rightly; a wrong model's parameters mean something else.
-fn right_estimates<'a>(scored: &'a [Scored<'_>]) -> impl Iterator<Item = (&'a str, score::Estimate)> {
+fn right_estimates<'a>(
+    scored: &'a [Scored<'_>],
+) -> impl Iterator<Item = (&'a str, score::Estimate)> {
     scored
         .iter()
         .filter(|one| one.judged.outcome.right())
@@ -497,7 +504,11 @@ fn parameters(scored: &[Scored<'_>]) -> Vec<ParameterLine> {
         .into_iter()
         .map(|((effect, name), estimates)| {
             // A gain's error counts against its distance from 1, what it would be without the effect.
-            let off = if name == "gain" || name == "gain_ratio" { 1.0 } else { 0.0 };
+            let off = if name == "gain" || name == "gain_ratio" {
+                1.0
+            } else {
+                0.0
+            };
             let errors: Vec<f64> = estimates
                 .iter()
                 .filter(|one| one.truth != off)
@@ -508,7 +519,9 @@ fn parameters(scored: &[Scored<'_>]) -> Vec<ParameterLine> {
                 name,
                 cases: estimates.len(),
                 median_error: median(&errors),
-                covered: Share::of(estimates.iter().filter_map(|one| one.covered), |covered| *covered),
+                covered: Share::of(estimates.iter().filter_map(|one| one.covered), |covered| {
+                    *covered
+                }),
             }
         })
         .collect()
@@ -588,7 +601,9 @@ fn real(scored: &[Scored<'_>]) -> Vec<RealLine> {
         .filter(|one| one.record.planned.group == Group::Real)
         .map(|one| {
             let said = one.record.said.clone().unwrap_or_default();
-            let main = said.main_held_out().map(|(name, errors)| (name.to_owned(), errors));
+            let main = said
+                .main_held_out()
+                .map(|(name, errors)| (name.to_owned(), errors));
             RealLine {
                 id: one.record.planned.case.drive.clone(),
                 standing: one.truth.standing.clone().unwrap_or_default(),
@@ -614,7 +629,8 @@ fn real(scored: &[Scored<'_>]) -> Vec<RealLine> {
                             low: wanted.low,
                             high: wanted.high,
                             said: found.and_then(|parameter| parameter.value),
-                            interval: found.and_then(|parameter| Some((parameter.low?, parameter.high?))),
+                            interval: found
+                                .and_then(|parameter| Some((parameter.low?, parameter.high?))),
                         }
                     })
                     .collect(),
@@ -633,7 +649,12 @@ fn real(scored: &[Scored<'_>]) -> Vec<RealLine> {
 /// A method's names as the tool would say them.
 fn as_said(found: &Found) -> Said {
     Said {
-        verdict: if found.named.is_empty() { "no-mismatch" } else { "explained" }.to_owned(),
+        verdict: if found.named.is_empty() {
+            "no-mismatch"
+        } else {
+            "explained"
+        }
+        .to_owned(),
         named: found
             .named
             .iter()
@@ -659,7 +680,10 @@ fn applies(found: &Found) -> bool {
 }
 
 fn methods(scored: &[Scored<'_>]) -> Vec<MethodLine> {
-    let names: BTreeSet<&String> = scored.iter().flat_map(|one| one.record.methods.keys()).collect();
+    let names: BTreeSet<&String> = scored
+        .iter()
+        .flat_map(|one| one.record.methods.keys())
+        .collect();
     if names.is_empty() {
         return Vec::new();
     }
@@ -667,43 +691,20 @@ fn methods(scored: &[Scored<'_>]) -> Vec<MethodLine> {
         .iter()
         .filter(|one| one.record.methods.values().any(applies))
         .collect();
-    let line = |name: &str, cases: &[(&Scored<'_>, Judgement, bool, Option<f64>, Option<f64>)], errors: usize| {
-        let hidden = || cases.iter().filter(|case| case.0.hidden());
-        let collect = |of: &dyn Fn(&(&Scored<'_>, Judgement, bool, Option<f64>, Option<f64>)) -> Option<f64>| {
-            cases.iter().filter_map(of).collect::<Vec<f64>>()
-        };
-        MethodLine {
-            name: name.to_owned(),
-            cases: cases.len(),
-            right: Share::of(hidden(), |case| case.1.outcome.right()),
-            wrong: Share::of(hidden(), |case| case.1.outcome == Outcome::Wrong),
-            false_alarms: Share::of(
-                cases.iter().filter(|case| case.0.record.planned.group == Group::Clean),
-                |case| case.2,
-            ),
-            over_oracle: median(&collect(&|case| {
-                let oracle = case.0.truth.oracle_rms.as_ref()?.holdout?;
-                Some(case.3? / oracle)
-            })),
-            seconds: median(&collect(&|case| case.4)),
-            errors,
-            names_effects: cases.iter().any(|case| case.2),
-        }
-    };
-    let twin: Vec<_> = compared
+    let twin: Vec<Compared<'_>> = compared
         .iter()
         .map(|one| {
             let said = one.record.said.as_ref();
-            (
-                *one,
-                one.judged.clone(),
-                said.is_some_and(|said| !said.named.is_empty()),
-                said.and_then(|said| Some(said.main_held_out()?.1.after)),
-                said.map(|said| said.taken.processor_s),
-            )
+            Compared {
+                scored: one,
+                judged: one.judged.clone(),
+                names: said.is_some_and(|said| !said.named.is_empty()),
+                held_out: said.and_then(|said| Some(said.main_held_out()?.1.after)),
+                seconds: said.map(|said| said.taken.processor_s),
+            }
         })
         .collect();
-    let mut lines = vec![line("twin", &twin, 0)];
+    let mut lines = vec![method_line("twin", &twin, 0)];
     for name in names {
         let mut cases = Vec::new();
         let mut errors = 0;
@@ -715,18 +716,68 @@ fn methods(scored: &[Scored<'_>]) -> Vec<MethodLine> {
             if !applies(found) {
                 continue;
             }
-            let said = as_said(found);
-            let judged = score::judge(one.truth, one.record.planned.case.strength(), &[], Some(&said));
-            cases.push((*one, judged, !found.named.is_empty(), found.held_out_rms, found.seconds));
+            cases.push(Compared {
+                scored: one,
+                judged: score::judge(
+                    one.truth,
+                    one.record.planned.case.strength(),
+                    &[],
+                    Some(&as_said(found)),
+                ),
+                names: !found.named.is_empty(),
+                held_out: found.held_out_rms,
+                seconds: found.seconds,
+            });
         }
-        lines.push(line(name, &cases, errors));
+        lines.push(method_line(name, &cases, errors));
     }
     lines
 }
 
+/// A method, or the tool, on one case.
+struct Compared<'a> {
+    scored: &'a Scored<'a>,
+    judged: Judgement,
+    names: bool,
+    held_out: Option<f64>,
+    seconds: Option<f64>,
+}
+
+fn method_line(name: &str, cases: &[Compared<'_>], errors: usize) -> MethodLine {
+    let hidden = || {
+        cases
+            .iter()
+            .filter(|case| case.scored.hidden() && case.judged.outcome != Outcome::Unscored)
+    };
+    let over_oracle: Vec<f64> = cases
+        .iter()
+        .filter_map(|case| Some(case.held_out? / case.scored.truth.oracle_rms.as_ref()?.holdout?))
+        .collect();
+    let seconds: Vec<f64> = cases.iter().filter_map(|case| case.seconds).collect();
+    MethodLine {
+        name: name.to_owned(),
+        cases: cases.len(),
+        right: Share::of(hidden(), |case| case.judged.outcome.right()),
+        wrong: Share::of(hidden(), |case| case.judged.outcome == Outcome::Wrong),
+        false_alarms: Share::of(
+            cases
+                .iter()
+                .filter(|case| case.scored.record.planned.group == Group::Clean),
+            |case| case.names,
+        ),
+        over_oracle: median(&over_oracle),
+        seconds: median(&seconds),
+        errors,
+        names_effects: cases.iter().any(|case| case.names),
+    }
+}
+
 fn beaten(scored: &[Scored<'_>]) -> Vec<(String, String)> {
     let mut beaten = Vec::new();
-    for one in scored.iter().filter(|one| one.record.planned.group == Group::Real) {
+    for one in scored
+        .iter()
+        .filter(|one| one.record.planned.group == Group::Real)
+    {
         let ours = one
             .record
             .said
@@ -747,7 +798,10 @@ fn beaten(scored: &[Scored<'_>]) -> Vec<(String, String)> {
 /// Of the cases in which the tool is right and a method is too: the fastest such method's time over the tool's.
 fn speed(scored: &[Scored<'_>]) -> Option<(f64, usize)> {
     let mut ratios = Vec::new();
-    for one in scored.iter().filter(|one| one.hidden() && one.judged.outcome.right()) {
+    for one in scored
+        .iter()
+        .filter(|one| one.hidden() && one.judged.outcome.right())
+    {
         let Some(said) = &one.record.said else {
             continue;
         };
@@ -759,7 +813,11 @@ fn speed(scored: &[Scored<'_>]) -> Option<(f64, usize)> {
             .methods
             .values()
             .filter(|found| applies(found))
-            .filter(|found| found.held_out_rms.is_some_and(|theirs| theirs <= AS_WELL * ours.after))
+            .filter(|found| {
+                found
+                    .held_out_rms
+                    .is_some_and(|theirs| theirs <= AS_WELL * ours.after)
+            })
             .filter(|found| {
                 let judged = score::judge(
                     one.truth,
@@ -791,7 +849,12 @@ fn board(records: &[Record]) -> Vec<BoardLine> {
                 .options
                 .get("sensor")
                 .and_then(|list| list.as_array())
-                .map(|list| list.iter().filter_map(|one| one.as_str()).collect::<Vec<_>>().join(", "))
+                .map(|list| {
+                    list.iter()
+                        .filter_map(|one| one.as_str())
+                        .collect::<Vec<_>>()
+                        .join(", ")
+                })
                 .unwrap_or_default(),
             outcome: record.judgement().map(|judged| judged.outcome),
             named: record.said.clone().unwrap_or_default().named,
@@ -872,7 +935,10 @@ fn targets(summary: &Summary) -> Vec<Target> {
     ];
     for line in &summary.clean {
         targets.push(share(
-            &format!("false alarms on clean recordings, {}", kind_title(&line.kind)),
+            &format!(
+                "false alarms on clean recordings, {}",
+                kind_title(&line.kind)
+            ),
             "≤ 5 %",
             &line.anything,
             line.anything.value() <= 0.05,
@@ -886,7 +952,10 @@ fn targets(summary: &Summary) -> Vec<Target> {
     ));
     for (kind, covered) in &summary.coverage {
         targets.push(share(
-            &format!("95 % intervals with the truth in them, {}", kind_title(kind)),
+            &format!(
+                "95 % intervals with the truth in them, {}",
+                kind_title(kind)
+            ),
             "90 … 98 %",
             covered,
             (0.9..=0.98).contains(&covered.value()),
@@ -898,9 +967,14 @@ fn targets(summary: &Summary) -> Vec<Target> {
         .filter(|line| line.methods.values().any(applies))
         .map(|line| line.id.as_str())
         .collect();
-    let worse: BTreeSet<&str> = summary.beaten_on_real.iter().map(|(id, _)| id.as_str()).collect();
+    let worse: BTreeSet<&str> = summary
+        .beaten_on_real
+        .iter()
+        .map(|(id, _)| id.as_str())
+        .collect();
     targets.push(Target {
-        what: "real recordings on which the held-out error is lower than every baseline's".to_owned(),
+        what: "real recordings on which the held-out error is lower than every baseline's"
+            .to_owned(),
         wanted: "all".to_owned(),
         found: format!("{} of {}", compared.len() - worse.len(), compared.len()),
         met: (!compared.is_empty()).then_some(worse.is_empty()),

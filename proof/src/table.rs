@@ -26,7 +26,11 @@ impl Table {
                     f64::NAN
                 } else {
                     field.trim().parse().with_context(|| {
-                        format!("{}, row {}: {field:?} is no number", path.display(), row + 1)
+                        format!(
+                            "{}, row {}: {field:?} is no number",
+                            path.display(),
+                            row + 1
+                        )
                     })?
                 });
             }
@@ -69,9 +73,7 @@ impl Table {
             columns: self
                 .columns
                 .iter()
-                .map(|(name, values)| {
-                    (name.clone(), rows.iter().map(|row| values[*row]).collect())
-                })
+                .map(|(name, values)| (name.clone(), rows.iter().map(|row| values[*row]).collect()))
                 .collect(),
         }
     }

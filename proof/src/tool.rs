@@ -93,7 +93,13 @@ pub struct Said {
 
 /// Columns in which errors are compared, in the order in which one stands for all.
 const MEASURED: [&str; 7] = [
-    "i_meas_a", "p_meas_w", "v_cell_v", "v_pack_v", "q_meas_c", "soc_pct", "h_meas_a_per_m",
+    "i_meas_a",
+    "p_meas_w",
+    "v_cell_v",
+    "v_pack_v",
+    "q_meas_c",
+    "soc_pct",
+    "h_meas_a_per_m",
 ];
 
 impl Said {
@@ -126,9 +132,21 @@ impl Tool {
     }
 
     /// Explains `recording.csv` by `model.toml` in `folder`, into `folder/out`. The tool knows of no other file.
-    pub fn explain(&self, folder: &Path, out: &str, given: &Given, limit: Duration) -> Result<Said> {
+    pub fn explain(
+        &self,
+        folder: &Path,
+        out: &str,
+        given: &Given,
+        limit: Duration,
+    ) -> Result<Said> {
         let mut command = self.command(folder);
-        command.args(["explain", "--model", "model.toml", "--recording", "recording.csv"]);
+        command.args([
+            "explain",
+            "--model",
+            "model.toml",
+            "--recording",
+            "recording.csv",
+        ]);
         if given.two_clocks {
             command.args(["--reference", "reference.csv"]);
         }
@@ -138,8 +156,8 @@ impl Tool {
         command.args(["--out", out]);
         let taken = program::run(&mut command, limit).context("twin explain")?;
         let report = folder.join(out).join("report.json");
-        let text = fs::read_to_string(&report)
-            .with_context(|| format!("reading {}", report.display()))?;
+        let text =
+            fs::read_to_string(&report).with_context(|| format!("reading {}", report.display()))?;
         let mut said = read(&serde_json::from_str(&text).context("report.json")?)?;
         said.taken = taken;
         Ok(said)
@@ -158,11 +176,12 @@ impl Tool {
         let mut simulated = Vec::new();
         for (model, out) in [(designed, "designed.csv"), (found, "found.csv")] {
             let mut command = self.command(kept);
-            command
-                .arg("simulate")
-                .arg("--model")
-                .arg(model)
-                .args(["--recording", "holdout.csv", "--out", out]);
+            command.arg("simulate").arg("--model").arg(model).args([
+                "--recording",
+                "holdout.csv",
+                "--out",
+                out,
+            ]);
             if two_clocks {
                 command.args(["--reference", "holdout-reference.csv"]);
             }
@@ -192,7 +211,8 @@ impl Tool {
                     truth[*row].is_finite() && before[*row].is_finite() && after[*row].is_finite()
                 })
                 .collect();
-            let error = |values: &[f64]| stats::rms(rows.iter().map(|row| values[*row] - truth[*row]));
+            let error =
+                |values: &[f64]| stats::rms(rows.iter().map(|row| values[*row] - truth[*row]));
             if let (Some(before), Some(after)) = (error(before), error(after)) {
                 errors.insert(
                     name.to_owned(),
