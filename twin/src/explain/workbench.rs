@@ -1,8 +1,10 @@
 //! One problem, ready to be fitted: the rows that count, blocks of them, and what sizes are natural.
 
+use std::collections::HashMap;
 use std::ops::Range;
+use std::sync::Mutex;
 
-use crate::effects::chain::{Chain, Nuisance};
+use crate::effects::chain::{Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
 use crate::effects::{Clues, Effect, LIBRARY, Stage};
 use crate::problem::{Base, Problem};
@@ -95,6 +97,29 @@ pub struct Workbench<'a> {
     pub blocks: Vec<Range<usize>>,
     /// Effects that may be named.
     pub library: Vec<&'static dyn Effect>,
+    /// Fits that were made: from which model to which, with spread and loss.
+    known: Mutex<HashMap<Key, (Model, f64, f64)>>,
+}
+
+/// A model to the last digit.
+type Key = (Vec<(&'static str, Vec<u64>)>, [u64; 3]);
+
+fn key(model: &Model) -> Key {
+    let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect();
+    let nuisance = &model.nuisance;
+    (
+        model
+            .members
+            .iter()
+            .map(|member| (member.id(), bits(&member.values)))
+            .collect(),
+        [
+            nuisance.soc_shift,
+            nuisance.resistance,
+            nuisance.alignment_s,
+        ]
+        .map(f64::to_bits),
+    )
 }
 
 impl<'a> Workbench<'a> {
@@ -140,6 +165,19 @@ impl<'a> Workbench<'a> {
             reference,
             blocks,
             library,
+            known: Mutex::default(),
+        }
+    }
+
+    /// The model that a fit from this one ended at, with spread and loss, if it was made before.
+    pub fn known(&self, from: &Model) -> Option<(Model, f64, f64)> {
+        self.known.lock().ok()?.get(&key(from)).cloned()
+    }
+
+    /// Remembers where a fit ended.
+    pub fn remember(&self, from: &Model, to: &Model, sigma: f64, cost: f64) {
+        if let Ok(mut known) = self.known.lock() {
+            known.insert(key(from), (to.clone(), sigma, cost));
         }
     }
 
@@ -155,17 +193,30 @@ impl<'a> Workbench<'a> {
 
     /// The simulation at every observed row.
     pub fn everywhere(&self, model: &Model) -> Vec<f64> {
-        let members: Vec<(&'static dyn Effect, &[f64])> = model
-            .members
-            .iter()
-            .map(|member| (member.effect, member.values.as_slice()))
-            .collect();
-        self.chain.run(&members, model.nuisance)
+        self.chain.run(&members(model), model.nuisance)
     }
 
     /// The simulation at the rows that count.
     pub fn run(&self, model: &Model) -> Vec<f64> {
-        let all = self.everywhere(model);
+        self.thinned(self.everywhere(model))
+    }
+
+    /// The simulation of models that each differ from one in a single respect, at the rows that count.
+    pub fn vary(&self, model: &Model, others: &[(Change, Model)]) -> Vec<Vec<f64>> {
+        let variations: Vec<Variation<'_>> = others
+            .iter()
+            .map(|(change, other)| (*change, members(other), other.nuisance))
+            .collect();
+        self.chain
+            .vary(&members(model), model.nuisance, &variations, |all| {
+                self.thinned(all)
+            })
+    }
+
+    fn thinned(&self, all: Vec<f64>) -> Vec<f64> {
+        if self.rows.len() == all.len() {
+            return all;
+        }
         self.rows.iter().map(|&row| all[row]).collect()
     }
 
@@ -196,6 +247,14 @@ impl<'a> Workbench<'a> {
                 matches!(member.effect.card().stage, Stage::Filter | Stage::Converter)
             })
     }
+}
+
+fn members(model: &Model) -> Vec<(&'static dyn Effect, &[f64])> {
+    model
+        .members
+        .iter()
+        .map(|member| (member.effect, member.values.as_slice()))
+        .collect()
 }
 
 fn nearest(problem: &Problem, rows: &[usize]) -> Vec<f64> {
