@@ -76,19 +76,24 @@ pub fn lines(t_s: &[f64], values: &[f64], step_s: f64) -> Vec<Line> {
         if here < power[at - 1] || here < power[at + 1] {
             continue;
         }
-        let around = at.saturating_sub(2 * NEIGHBOURS).max(1)..(at + 2 * NEIGHBOURS).min(half);
-        let mut others: Vec<f64> = around
-            .filter(|other| other.abs_diff(at) > 10)
-            .map(|other| power[other])
-            .collect();
-        if others.len() < 20 {
+        let left = at.saturating_sub(2 * NEIGHBOURS).max(1)..at.saturating_sub(10);
+        let right = (at + 11).min(half)..(at + 2 * NEIGHBOURS).min(half);
+        let others = [
+            power.get(left).unwrap_or_default(),
+            power.get(right).unwrap_or_default(),
+        ];
+        let count = others[0].len() + others[1].len();
+        if count < 20 {
             continue;
         }
-        let middle = others.len() / 2;
-        // The median of an exponential distribution is ln 2 times its mean.
-        let mean =
-            *others.select_nth_unstable_by(middle, f64::total_cmp).1 / std::f64::consts::LN_2;
-        if mean > 0.0 && here / mean > threshold {
+        // The median of an exponential distribution is ln 2 times its mean. It is below a limit if more than half of the values
+        // are: no need to sort them.
+        let below = |limit: f64| {
+            let part = |values: &[f64]| values.iter().filter(|value| **value < limit).count();
+            part(others[0]) + part(others[1])
+        };
+        let limit = here * std::f64::consts::LN_2 / threshold;
+        if below(limit) > count / 2 && below(f64::MIN_POSITIVE) <= count / 2 {
             found.push((at, here));
         }
     }

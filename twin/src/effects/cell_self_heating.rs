@@ -1,6 +1,6 @@
 //! The cell warms itself.
 
-use super::scene::{Scale, Scene, ladder};
+use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
@@ -50,13 +50,13 @@ impl Effect for CellSelfHeating {
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
-        let drive = scene.drive;
+        let (drive, steps) = (scene.drive, scene.steps);
         let Some(battery) = &mut scene.battery else {
             return;
         };
         let ohms = battery.base.resistance_ohm;
         let losses: Vec<f64> = scene.signal.iter().map(|i| ohms * i * i).collect();
-        let heat = ladder(&drive.t_s, &drive.segments, &losses, [values[1]], [1.0]);
+        let heat = steps.ladder(&drive.segments, &losses, [values[1]], [1.0]);
         battery
             .temperature_c
             .iter_mut()

@@ -1,5 +1,6 @@
 //! The simulation while effects act on it: series on the drive's rows, then on the observation's.
 
+use std::collections::HashMap;
 use std::ops::Range;
 
 use crate::problem::{Base, BatteryBase, Drive, Observed, Problem, SensorBase, View};
@@ -9,7 +10,7 @@ pub const REFERENCE_C: f64 = 25.0;
 /// 0 °C in K.
 pub const ZERO_CELSIUS_K: f64 = 273.15;
 
-/// Steps whose exponentials are kept.
+/// Kinds of step that are remembered while steps are told apart.
 const KNOWN: usize = 16;
 
 /// What sizes are natural in a problem: bounds and starts follow from it.
@@ -46,6 +47,8 @@ pub struct Scene<'a> {
     pub drive: &'a Drive,
     /// When readings were taken.
     pub observed: &'a Observed,
+    /// Steps of the drive's rows.
+    pub steps: &'a Steps,
     /// The signal: on drive rows before [`super::Stage::Output`], then on the observation's rows.
     pub signal: Vec<f64>,
     /// Transport delay in s.
@@ -85,100 +88,146 @@ pub struct Battery<'a> {
     pub added_v: Vec<f64>,
 }
 
-/// First-order low-pass by straight lines between samples, exact (the drive's rows may be irregular).
-///
-/// y(t+h) = e^(−h/τ)·y + (1 − e^(−h/τ))·u₀ + (u₁−u₀)·(1 − τ/h·(1 − e^(−h/τ)))
-pub fn low_pass(
-    t_s: &[f64],
-    segments: &[Range<usize>],
-    input: &[f64],
-    tau_s: f64,
-    held: bool,
-) -> Vec<f64> {
-    let mut output = input.to_vec();
-    if tau_s.is_nan() || tau_s <= 0.0 {
-        return output;
-    }
-    // Steps repeat, with some jitter: an exponential for each row would be most of the time.
-    let mut known = [(f64::NAN, 0.0, 0.0); KNOWN];
-    for rows in segments.iter().filter(|rows| !rows.is_empty()) {
-        let mut last = input[rows.start];
-        output[rows.start] = last;
-        for row in rows.start + 1..rows.end {
-            let h = t_s[row] - t_s[row - 1];
-            if h <= 0.0 {
-                output[row] = last;
-                continue;
-            }
-            // To a nanosecond: differences of times carry rounding.
-            let nanos = (h * 1e9).round();
-            let slot = &mut known[(nanos as u64 / 1_000_000) as usize % KNOWN];
-            if slot.0 != nanos {
-                let kept = (-h / tau_s).exp();
-                *slot = (nanos, kept, 1.0 - tau_s / h * (1.0 - kept));
-            }
-            let (_, kept, ramp) = *slot;
-            let from = input[row - 1];
-            let rise = if held { 0.0 } else { input[row] - from };
-            last = kept * last + (1.0 - kept) * from + rise * ramp;
-            output[row] = last;
-        }
-    }
-    output
+/// Steps between the drive's rows, told apart to a nanosecond (differences of times carry rounding). Steps repeat, with some
+/// jitter: a filter needs the exponential of each kind once, not of each row.
+#[derive(Clone, Debug, Default)]
+pub struct Steps {
+    /// Kind of the step that ends at each row; 0: no step.
+    kind: Vec<u32>,
+    /// Length of each kind in s.
+    length_s: Vec<f64>,
 }
 
-/// A sum of first-order low-passes of one input, each with a weight, all at rest when a segment begins: one pass over the rows.
-pub fn ladder<const N: usize>(
-    t_s: &[f64],
-    segments: &[Range<usize>],
-    input: &[f64],
-    taus_s: [f64; N],
-    weights: [f64; N],
-) -> Vec<f64> {
-    let mut output = vec![0.0; input.len()];
-    let mut known = [(f64::NAN, [0.0; N], [0.0; N]); KNOWN];
-    for rows in segments.iter().filter(|rows| !rows.is_empty()) {
-        let mut last = [0.0; N];
-        for row in rows.start + 1..rows.end {
-            let h = t_s[row] - t_s[row - 1];
-            if h > 0.0 {
-                let nanos = (h * 1e9).round();
-                let slot = &mut known[(nanos as u64 / 1_000_000) as usize % KNOWN];
+impl Steps {
+    /// Of a drive's rows.
+    pub fn new(t_s: &[f64], segments: &[Range<usize>]) -> Self {
+        let mut kind = vec![0; t_s.len()];
+        let mut length_s = vec![0.0];
+        let mut numbers: HashMap<u64, u32> = HashMap::new();
+        let mut known = [(u64::MAX, 0u32); KNOWN];
+        for rows in segments.iter().filter(|rows| !rows.is_empty()) {
+            for row in rows.start + 1..rows.end {
+                let h = t_s[row] - t_s[row - 1];
+                if h.is_nan() || h <= 0.0 {
+                    continue;
+                }
+                let nanos = (h * 1e9).round() as u64;
+                let slot = &mut known[(nanos / 1_000_000) as usize % KNOWN];
                 if slot.0 != nanos {
-                    slot.0 = nanos;
-                    for (k, tau_s) in taus_s.iter().enumerate() {
-                        let kept = (-h / tau_s).exp();
-                        slot.1[k] = kept;
-                        slot.2[k] = 1.0 - tau_s / h * (1.0 - kept);
-                    }
+                    let number = *numbers.entry(nanos).or_insert_with(|| {
+                        length_s.push(h);
+                        length_s.len() as u32 - 1
+                    });
+                    *slot = (nanos, number);
                 }
-                let (from, rise) = (input[row - 1], input[row] - input[row - 1]);
-                for (k, last) in last.iter_mut().enumerate() {
-                    *last = slot.1[k] * (*last - from) + from + rise * slot.2[k];
-                }
+                kind[row] = slot.1;
             }
-            let mut sum = 0.0;
-            for k in 0..N {
-                sum += weights[k] * last[k];
-            }
-            output[row] = sum;
         }
+        Self { kind, length_s }
     }
-    output
+
+    /// Weights of a first-order low-pass over each kind of step: of the last output, of the input where the step begins and of
+    /// that where it ends.
+    fn weights(&self, tau_s: f64, held: bool) -> impl Iterator<Item = [f64; 3]> + '_ {
+        self.length_s.iter().map(move |h| {
+            if *h <= 0.0 {
+                return [1.0, 0.0, 0.0];
+            }
+            let kept = (-h / tau_s).exp();
+            let ramp = if held {
+                0.0
+            } else {
+                1.0 - tau_s / h * (1.0 - kept)
+            };
+            [kept, 1.0 - kept - ramp, ramp]
+        })
+    }
+
+    /// First-order low-pass by straight lines between samples, exact (the drive's rows may be irregular).
+    ///
+    /// y(t+h) = e^(−h/τ)·y + (1 − e^(−h/τ))·u₀ + (u₁−u₀)·(1 − τ/h·(1 − e^(−h/τ)))
+    pub fn low_pass(
+        &self,
+        segments: &[Range<usize>],
+        input: &[f64],
+        tau_s: f64,
+        held: bool,
+    ) -> Vec<f64> {
+        let mut output = input.to_vec();
+        if tau_s.is_nan() || tau_s <= 0.0 {
+            return output;
+        }
+        let weights: Vec<[f64; 3]> = self.weights(tau_s, held).collect();
+        for rows in segments.iter().filter(|rows| !rows.is_empty()) {
+            let mut last = input[rows.start];
+            let after = rows.start + 1..rows.end;
+            let pairs = input[rows.clone()].windows(2);
+            for ((pair, out), kind) in pairs.zip(&mut output[after.clone()]).zip(&self.kind[after])
+            {
+                let [kept, from, to] = weights[*kind as usize];
+                last = kept * last + (from * pair[0] + to * pair[1]);
+                *out = last;
+            }
+        }
+        output
+    }
+
+    /// A sum of first-order low-passes of one input, each with a weight, all at rest when a segment begins: one pass over the
+    /// rows.
+    pub fn ladder<const N: usize>(
+        &self,
+        segments: &[Range<usize>],
+        input: &[f64],
+        taus_s: [f64; N],
+        weights: [f64; N],
+    ) -> Vec<f64> {
+        let mut output = vec![0.0; input.len()];
+        let mut of_kind = vec![[[0.0; N]; 3]; self.length_s.len()];
+        for k in 0..N {
+            for (all, [kept, from, to]) in of_kind.iter_mut().zip(self.weights(taus_s[k], false)) {
+                all[0][k] = kept;
+                all[1][k] = weights[k] * from;
+                all[2][k] = weights[k] * to;
+            }
+        }
+        for rows in segments.iter().filter(|rows| !rows.is_empty()) {
+            let mut last = [0.0; N];
+            let after = rows.start + 1..rows.end;
+            let pairs = input[rows.clone()].windows(2);
+            for ((pair, out), kind) in pairs.zip(&mut output[after.clone()]).zip(&self.kind[after])
+            {
+                let [kept, from, to] = &of_kind[*kind as usize];
+                let mut sum = 0.0;
+                for k in 0..N {
+                    last[k] = kept[k] * last[k] + (from[k] * pair[0] + to[k] * pair[1]);
+                    sum += last[k];
+                }
+                *out = sum;
+            }
+        }
+        output
+    }
 }
 
 /// Integral over time from the start of each segment: trapezoids, or the last value held.
 pub fn integral(t_s: &[f64], segments: &[Range<usize>], input: &[f64], held: bool) -> Vec<f64> {
     let mut output = vec![0.0; input.len()];
-    for rows in segments {
-        for row in rows.clone().skip(1) {
-            let h = t_s[row] - t_s[row - 1];
+    for rows in segments.iter().filter(|rows| !rows.is_empty()) {
+        let mut sum = 0.0;
+        let steps = t_s[rows.clone()].windows(2);
+        let pairs = input[rows.clone()].windows(2);
+        for ((out, times), pair) in output[rows.start + 1..rows.end]
+            .iter_mut()
+            .zip(steps)
+            .zip(pairs)
+        {
             let mean = if held {
-                input[row - 1]
+                pair[0]
             } else {
-                0.5 * (input[row] + input[row - 1])
+                0.5 * (pair[1] + pair[0])
             };
-            output[row] = output[row - 1] + mean * h;
+            sum += mean * (times[1] - times[0]);
+            *out = sum;
         }
     }
     output
@@ -202,7 +251,8 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Moves so that `at` is the last row not after `t`; false if `t` is outside by more than `slack_s`.
+    /// Moves so that `at` is the last row not after `t`.
+    #[inline]
     fn seek(&mut self, t: f64) {
         while self.at > self.rows.start && self.t_s[self.at] > t {
             self.at -= 1;
@@ -213,6 +263,7 @@ impl<'a> Cursor<'a> {
     }
 
     /// Value at a time: straight lines, or the last value held; the first and last value beyond the ends.
+    #[inline]
     pub fn value(&mut self, series: &[f64], t: f64, held: bool) -> f64 {
         self.seek(t);
         let at = self.at;
@@ -225,6 +276,7 @@ impl<'a> Cursor<'a> {
     }
 
     /// Integral (as [`integral`] gives it at rows) at a time; beyond the ends the signal holds its end values.
+    #[inline]
     pub fn integral(&mut self, integral: &[f64], series: &[f64], t: f64, held: bool) -> f64 {
         self.seek(t);
         let at = self.at;
@@ -256,10 +308,26 @@ pub fn boxcar(
     }
     let total = integral(t_s, segments, input, held);
     for rows in segments {
-        let mut back = Cursor::new(t_s, rows.clone());
-        for row in rows.clone() {
-            let start = back.integral(&total, input, t_s[row] - window_s, held);
-            output[row] = (total[row] - start) / window_s;
+        let (t, x, total) = (
+            &t_s[rows.clone()],
+            &input[rows.clone()],
+            &total[rows.clone()],
+        );
+        // The row that the window begins after: times go forward within a segment.
+        let mut at = 0;
+        for ((out, now), until) in output[rows.clone()].iter_mut().zip(t).zip(total) {
+            let begin = now - window_s;
+            while at + 1 < t.len() && t[at + 1] <= begin {
+                at += 1;
+            }
+            let h = begin - t[at];
+            let start = if h <= 0.0 || held || at + 1 >= t.len() {
+                total[at] + x[at] * h
+            } else {
+                let end = x[at] + (x[at + 1] - x[at]) * (h / (t[at + 1] - t[at]));
+                total[at] + 0.5 * (x[at] + end) * h
+            };
+            *out = (until - start) / window_s;
         }
     }
     output
@@ -267,7 +335,7 @@ pub fn boxcar(
 
 impl<'a> Scene<'a> {
     /// The simulation before any effect.
-    pub fn new(problem: &'a Problem) -> Self {
+    pub fn new(problem: &'a Problem, steps: &'a Steps) -> Self {
         let drive = &problem.drive;
         let (sensor, battery) = match &problem.base {
             Base::Sensor(base) => (Some(base), None),
@@ -276,6 +344,7 @@ impl<'a> Scene<'a> {
         Self {
             drive,
             observed: &problem.observed,
+            steps,
             signal: drive.reference.clone(),
             delay_s: 0.0,
             skew: 0.0,
@@ -291,13 +360,8 @@ impl<'a> Scene<'a> {
 
     /// First-order low-pass of the scene's own signal.
     pub fn low_pass(&self, input: &[f64], tau_s: f64) -> Vec<f64> {
-        low_pass(
-            &self.drive.t_s,
-            &self.drive.segments,
-            input,
-            tau_s,
-            self.held(),
-        )
+        self.steps
+            .low_pass(&self.drive.segments, input, tau_s, self.held())
     }
 
     /// From drive rows to the observation's rows.
@@ -312,35 +376,43 @@ impl<'a> Scene<'a> {
         let total = (view == View::Charge)
             .then(|| integral(&drive.t_s, &drive.segments, &self.signal, held));
         let mut sampled = vec![f64::NAN; observed.t_s.len()];
-        let mut current: Option<(usize, Cursor<'_>)> = None;
-        let mut last: Option<(f64, f64)> = None;
-        for (row, value) in sampled.iter_mut().enumerate() {
-            let segment = observed.segment[row];
-            let Some(rows) = drive.segments.get(segment).filter(|rows| !rows.is_empty()) else {
-                continue;
-            };
-            if current.as_ref().is_none_or(|(known, _)| *known != segment) {
-                current = Some((segment, Cursor::new(&drive.t_s, rows.clone())));
-                last = None;
-            }
-            let Some((_, cursor)) = &mut current else {
+        let (skew, delay_s) = (1.0 + self.skew, self.delay_s);
+        let mut from = 0;
+        let mut known: (usize, Option<(f64, f64)>) = (usize::MAX, None);
+        // One stretch of readings after the other, each within one segment.
+        for readings in observed.segment.chunk_by(|a, b| a == b) {
+            let these = from..from + readings.len();
+            from = these.end;
+            let rows = drive.segments.get(readings[0]).cloned();
+            let Some(rows) = rows.filter(|rows| !rows.is_empty()) else {
                 continue;
             };
             let start = drive.t_s[rows.start];
+            let mut cursor = Cursor::new(&drive.t_s, rows);
+            let times = &observed.t_s[these.clone()];
+            let values = &mut sampled[these.clone()];
             // What the sensor's clock calls t was at this time.
-            let t = start + (observed.t_s[row] - start) / (1.0 + self.skew) - self.delay_s;
-            match &total {
-                None => *value = cursor.value(&self.signal, t, held),
-                Some(total) => {
-                    let charge = cursor.integral(total, &self.signal, t, held);
-                    if let Some((before_t, before)) = last
-                        && t > before_t
-                    {
-                        *value = (charge - before) / (t - before_t);
-                    }
-                    if observed.valid[row] || last.is_none() {
-                        last = Some((t, charge));
-                    }
+            let reference_s = |t: f64| start + (t - start) / skew - delay_s;
+            let Some(total) = &total else {
+                for (value, t) in values.iter_mut().zip(times) {
+                    *value = cursor.value(&self.signal, reference_s(*t), held);
+                }
+                continue;
+            };
+            if known.0 != readings[0] {
+                known = (readings[0], None);
+            }
+            let last = &mut known.1;
+            for ((value, t), valid) in values.iter_mut().zip(times).zip(&observed.valid[these]) {
+                let t = reference_s(*t);
+                let charge = cursor.integral(total, &self.signal, t, held);
+                if let Some((before_t, before)) = *last
+                    && t > before_t
+                {
+                    *value = (charge - before) / (t - before_t);
+                }
+                if *valid || last.is_none() {
+                    *last = Some((t, charge));
                 }
             }
         }
@@ -458,7 +530,7 @@ mod tests {
     #[test]
     fn a_low_pass_follows_a_ramp_late_by_tau() {
         let t_s: Vec<f64> = (0..2000).map(|k| f64::from(k) * 0.01).collect();
-        let output = low_pass(&t_s, &[0..2000], &t_s, 0.5, false);
+        let output = Steps::new(&t_s, &[0..2000]).low_pass(&[0..2000], &t_s, 0.5, false);
         assert!((output[1999] - (t_s[1999] - 0.5)).abs() < 1e-9);
     }
 
@@ -474,7 +546,7 @@ mod tests {
         let t_s: Vec<f64> = (0..100).map(|k| f64::from(k) * 0.1).collect();
         let mut step = vec![1.0; 100];
         step[0] = 0.0;
-        let held = low_pass(&t_s, &[0..100], &step, 2.0, true);
+        let held = Steps::new(&t_s, &[0..100]).low_pass(&[0..100], &step, 2.0, true);
         // The held 0 lasts until the second row.
         assert!((held[41] - (1.0 - (-4.0f64 / 2.0).exp())).abs() < 1e-9);
     }

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::fit::{Fit, fit, held_out, huber, polish, spread};
+use super::fit::{Fit, fit, held_out, huber, polish};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search, Stage, find};
@@ -235,15 +235,7 @@ fn marked(
             equivalent: Vec::new(),
         });
         // The other values are those of the smooth simulation: steps have no slope to fit by.
-        let predicted = bench.run(&model);
-        let residual = bench.residual(&predicted);
-        now = Fit {
-            sigma: spread(&residual),
-            model,
-            predicted,
-            residual,
-            cost: smooth.cost,
-        };
+        now = Fit::of(bench, model, smooth.cost);
     }
     (now, named)
 }

@@ -1,12 +1,14 @@
 //! One problem, ready to be fitted: the rows that count, blocks of them, and what sizes are natural.
 
+use std::collections::HashMap;
 use std::ops::Range;
+use std::sync::Mutex;
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use rand_distr::{Distribution as _, StandardNormal};
 
-use crate::effects::chain::{Chain, Nuisance};
+use crate::effects::chain::{Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
 use crate::effects::{Clues, Effect, LIBRARY, Stage};
 use crate::problem::{Base, Problem};
@@ -101,6 +103,30 @@ pub struct Workbench<'a> {
     pub blocks: Vec<Range<usize>>,
     /// Effects that may be named.
     pub library: Vec<&'static dyn Effect>,
+    /// Fits that were made: from which model to which, with spread and loss.
+    known: Mutex<HashMap<Key, (Model, f64, f64)>>,
+}
+
+/// A model to the last digit.
+type Key = (Vec<(&'static str, Vec<u64>)>, [u64; 3], bool);
+
+fn key(model: &Model) -> Key {
+    let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect();
+    let nuisance = &model.nuisance;
+    (
+        model
+            .members
+            .iter()
+            .map(|member| (member.id(), bits(&member.values)))
+            .collect(),
+        [
+            nuisance.soc_shift,
+            nuisance.resistance,
+            nuisance.alignment_s,
+        ]
+        .map(f64::to_bits),
+        model.unaligned,
+    )
 }
 
 impl<'a> Workbench<'a> {
@@ -146,6 +172,19 @@ impl<'a> Workbench<'a> {
             reference,
             blocks,
             library,
+            known: Mutex::default(),
+        }
+    }
+
+    /// The model that a fit from this one ended at, with spread and loss, if it was made before.
+    pub fn known(&self, from: &Model) -> Option<(Model, f64, f64)> {
+        self.known.lock().ok()?.get(&key(from)).cloned()
+    }
+
+    /// Remembers where a fit ended.
+    pub fn remember(&self, from: &Model, to: &Model, sigma: f64, cost: f64) {
+        if let Ok(mut known) = self.known.lock() {
+            known.insert(key(from), (to.clone(), sigma, cost));
         }
     }
 
@@ -161,12 +200,7 @@ impl<'a> Workbench<'a> {
 
     /// The simulation at every observed row.
     pub fn everywhere(&self, model: &Model) -> Vec<f64> {
-        let members: Vec<(&'static dyn Effect, &[f64])> = model
-            .members
-            .iter()
-            .map(|member| (member.effect, member.values.as_slice()))
-            .collect();
-        self.chain.run(&members, model.nuisance)
+        self.chain.run(&members(model), model.nuisance)
     }
 
     /// Squared change, summed over the rows that count, that noise of a standard deviation ahead of the end of the chain makes to
@@ -178,14 +212,9 @@ impl<'a> Workbench<'a> {
             .take(self.problem.observed.t_s.len())
             .map(|value: f64| deviation * value)
             .collect();
-        let members: Vec<(&'static dyn Effect, &[f64])> = model
-            .members
-            .iter()
-            .map(|member| (member.effect, member.values.as_slice()))
-            .collect();
         let noisy = self
             .chain
-            .run_with_noise(&members, model.nuisance, &noise);
+            .run_with_noise(&members(model), model.nuisance, &noise);
         self.rows
             .iter()
             .zip(predicted)
@@ -196,7 +225,25 @@ impl<'a> Workbench<'a> {
 
     /// The simulation at the rows that count.
     pub fn run(&self, model: &Model) -> Vec<f64> {
-        let all = self.everywhere(model);
+        self.thinned(self.everywhere(model))
+    }
+
+    /// The simulation of models that each differ from one in a single respect, at the rows that count.
+    pub fn vary(&self, model: &Model, others: &[(Change, Model)]) -> Vec<Vec<f64>> {
+        let variations: Vec<Variation<'_>> = others
+            .iter()
+            .map(|(change, other)| (*change, members(other), other.nuisance))
+            .collect();
+        self.chain
+            .vary(&members(model), model.nuisance, &variations, |all| {
+                self.thinned(all)
+            })
+    }
+
+    fn thinned(&self, all: Vec<f64>) -> Vec<f64> {
+        if self.rows.len() == all.len() {
+            return all;
+        }
         self.rows.iter().map(|&row| all[row]).collect()
     }
 
@@ -228,6 +275,14 @@ impl<'a> Workbench<'a> {
                 matches!(member.effect.card().stage, Stage::Filter | Stage::Converter)
             })
     }
+}
+
+fn members(model: &Model) -> Vec<(&'static dyn Effect, &[f64])> {
+    model
+        .members
+        .iter()
+        .map(|member| (member.effect, member.values.as_slice()))
+        .collect()
 }
 
 fn nearest(problem: &Problem, rows: &[usize]) -> Vec<f64> {
