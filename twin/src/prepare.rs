@@ -65,6 +65,9 @@ pub struct Item {
     pub fresh: Vec<bool>,
 }
 
+/// Ages that are tried to either side where the rows do not tell the age of a reading.
+const PHASES: i32 = 10;
+
 /// Everything that explaining and simulating need.
 #[derive(Clone, Debug)]
 pub struct Prepared {
@@ -297,7 +300,7 @@ impl Work<'_> {
                 Pace::Seen => board.slack_s(&observed),
                 _ => 0.0,
             };
-            let reported = phase::closest(sensor.age_s, slack_s, &observed, run);
+            let (_, reported) = phase::closest(sensor.age_s, (slack_s, PHASES), &observed, run);
             self.compare_range_flag(board, &mut drive, &observed, &reported.range_high);
             base.reading = reported.current_a;
             fresh = reported.fresh;
