@@ -223,6 +223,28 @@ impl<'a> Workbench<'a> {
             .sum()
     }
 
+    /// How many standard deviations a fitted change is away from what the stated coloured noise does by itself: its projection
+    /// on the change has the variance `cᵀΣc`, with Σ of an exponential memory and white noise. Infinite if none is stated.
+    pub fn deviations(&self, change: &[f64]) -> f64 {
+        let coloured = self.problem.coloured;
+        if !(coloured.rms > 0.0 && coloured.tau_s > 0.0) {
+            return f64::INFINITY;
+        }
+        let (mut energy, mut together, mut memory) = (0.0, 0.0, 0.0);
+        let mut last: Option<(f64, f64)> = None;
+        for (t, c) in self.t_s.iter().zip(change) {
+            if let Some((before, previous)) = last {
+                memory = (memory + previous) * (-(t - before).max(0.0) / coloured.tau_s).exp();
+            }
+            energy += c * c;
+            together += c * memory;
+            last = Some((*t, *c));
+        }
+        let variance = self.problem.noise.powi(2) * energy
+            + 2.0 * coloured.rms.powi(2) * together;
+        energy / variance.max(1e-300).sqrt()
+    }
+
     /// The simulation at the rows that count.
     pub fn run(&self, model: &Model) -> Vec<f64> {
         self.thinned(self.everywhere(model))

@@ -6,7 +6,7 @@ use super::{FEWEST_ROWS, Item, Purpose, Work, checks, phase, series};
 use crate::{
     failure::Failure,
     model::Sensor,
-    problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View},
+    problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View},
     simulate::board::{Board, Pace},
 };
 
@@ -105,6 +105,7 @@ pub(super) fn item(
         modelled: Vec::new(),
         // A difference has the noise of both of its readings.
         noise: std::f64::consts::SQRT_2 * noise_c / spacing_s,
+        coloured: Coloured::default(),
         accuracy: Accuracy {
             zero: sensor.accuracy.zero,
             gain: sensor.accuracy.gain,
