@@ -12,8 +12,8 @@ from series import Series
 Array = np.ndarray
 
 # Rows for the fit: neighbouring rows are averaged until no more are left. An evaluation takes 30 ms for this many.
-MOST_ROWS = 2500
-ITERATIONS = 40
+MOST_ROWS = 2000
+ITERATIONS = 30
 # PyBaMM stops at a state of charge of 0 or 1. Counting may run a little over: its cell is this much larger at either end.
 MARGIN = 0.1
 STRETCH = 1.0 + 2.0 * MARGIN
