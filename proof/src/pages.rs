@@ -631,6 +631,10 @@ fn tables(summary: &Summary) -> String {
             shown(&line.covered)
         );
     }
+    text.push_str("\n## What it took\n\nSeconds of the wall clock, one processor each.\n\n| part | s |\n|---|---|\n");
+    for (part, seconds) in &summary.parts_s {
+        let _ = writeln!(text, "| {part} | {seconds:.0} |");
+    }
     if !summary.not_made.is_empty() {
         text.push_str("\n## Not made\n\nThe maker cannot have such a case (an effect of that strength on that drive); it counts nowhere.\n\n");
         for (id, why) in &summary.not_made {

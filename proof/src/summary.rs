@@ -209,6 +209,8 @@ pub struct Summary {
     pub processors: usize,
     /// Cases of the plan.
     pub cases: usize,
+    /// Seconds of the wall clock that each part took in all, on one processor.
+    pub parts_s: BTreeMap<String, f64>,
     /// Without data, by the maker's own limits: id and reason.
     pub not_made: Vec<(String, String)>,
     /// Failed: id and reason.
@@ -388,6 +390,7 @@ pub fn summary(records: &[Record], plan: &str, tool_sha256: String, processors: 
         tool_sha256,
         processors,
         cases: records.len(),
+        parts_s: parts(records),
         not_made: records
             .iter()
             .filter_map(|record| Some((record.planned.case.id.clone(), record.not_made.clone()?)))
@@ -422,6 +425,14 @@ pub fn summary(records: &[Record], plan: &str, tool_sha256: String, processors: 
     };
     summary.targets = targets(&summary);
     summary
+}
+
+fn parts(records: &[Record]) -> BTreeMap<String, f64> {
+    let mut all = BTreeMap::new();
+    for (part, seconds) in records.iter().flat_map(|record| &record.parts_s) {
+        *all.entry(part.clone()).or_insert(0.0) += seconds;
+    }
+    all
 }
 
 fn confusion(scored: &[Scored<'_>]) -> Vec<Confusion> {
