@@ -23,7 +23,7 @@ METHOD_MARKS = {
 }
 KINDS = {"a": "(a) real", "b": "(b) others' simulators", "c": "(c) others' solver", "d": "(d) our own"}
 OUTCOMES = [
-    ("exact", "right name", GREEN), ("class", "in a named class", SKY), ("quiet", "quiet, rightly", GREEN), ("part", "a part", ORANGE),
+    ("exact", "right name", GREEN), ("class", "in a named class", SKY), ("quiet", "quiet, rightly", "#8fd3bd"), ("part", "a part", ORANGE),
     ("unknown", "unknown", GREY), ("silent", "silent (weak)", "#dddddd"), ("missed", "missed", "#666666"), ("wrong", "wrong", RED),
     ("error", "failed", "#000000"),
 ]
@@ -93,7 +93,7 @@ def bars(axes, lines: list[dict]) -> None:
                 axes.barh(place, share, left=left, color=colour, label=None if word in used else word, edgecolor="white", lw=0.5)
                 used.add(word)
                 if share > 6:
-                    light = colour in ("#dddddd", SKY, ORANGE)
+                    light = colour in ("#dddddd", "#8fd3bd", SKY, ORANGE)
                     axes.text(left + share / 2, place, f"{line['outcomes'][outcome]}", ha="center", va="center",
                               color=INK if light else "white", fontsize=8)
             left += share
@@ -171,11 +171,12 @@ def detection(data: dict, folder: pathlib.Path) -> None:
         for strength, share in line["strengths"]:
             table[row, strengths.index(strength)] = value(share)
     figure, axes = plt.subplots(figsize=(5.6, 0.24 * len(lines) + 1.4))
-    image = axes.pcolormesh(table, cmap="RdYlGn", vmin=0, vmax=100, edgecolors="white", lw=1)
+    image = axes.pcolormesh(table, cmap="cividis", vmin=0, vmax=100, edgecolors="white", lw=1)
     for row in range(len(lines)):
         for column in range(len(strengths)):
             if np.isfinite(table[row, column]):
-                axes.text(column + 0.5, row + 0.5, f"{table[row, column]:.0f}", ha="center", va="center", fontsize=7)
+                axes.text(column + 0.5, row + 0.5, f"{table[row, column]:.0f}", ha="center", va="center", fontsize=7,
+                          color="white" if table[row, column] < 55 else INK)
     axes.set_xticks(np.arange(len(strengths)) + 0.5, [f"{strength:g}" for strength in strengths])
     axes.set_yticks(np.arange(len(lines)) + 0.5, [f"{line['effect']} ({line['kind']})" for line in lines])
     axes.invert_yaxis()

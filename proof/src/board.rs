@@ -9,7 +9,7 @@ use std::{
 
 use anyhow::{Context, Result, bail};
 use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value, json};
+use serde_json::{Map, json};
 
 use crate::{
     case::{Case, Group, Planned, TrueEffect, Truth},
@@ -90,13 +90,9 @@ pub struct Board {
 pub fn plan() -> Vec<Planned> {
     ERRORS
         .iter()
-        .enumerate()
-        .map(|(place, error)| {
+        .map(|error| {
             let mut options = Map::new();
             options.insert("sensor".to_owned(), json!(error.sensor));
-            if place == 0 {
-                options.insert("quick".to_owned(), Value::Bool(true));
-            }
             Planned {
                 group: Group::Board,
                 case: Case {

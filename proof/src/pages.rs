@@ -5,7 +5,7 @@ use std::{fmt::Write as _, fs, path::Path};
 use anyhow::{Context, Result};
 
 use crate::{
-    score::Outcome,
+    score::{Outcome, PLAIN},
     stats::Share,
     summary::{Confusion, Counts, RealLine, Summary, kind_title, shown},
     tool::Named,
@@ -50,6 +50,18 @@ pub fn number(value: f64) -> String {
     format!("{value:.*}", usize::try_from(digits).unwrap_or(0))
 }
 
+/// What a program said, in one cell of a table.
+fn cell(error: &str) -> String {
+    let line = error.replace(['|', '\n'], " ");
+    let words: Vec<&str> = line.split_whitespace().collect();
+    let mut short = words.join(" ");
+    if let Some((end, _)) = short.char_indices().nth(160) {
+        short.truncate(end);
+        short.push('…');
+    }
+    short
+}
+
 fn maybe(value: Option<f64>) -> String {
     value.map_or("–".to_owned(), number)
 }
@@ -58,17 +70,19 @@ fn names(named: &[Named]) -> String {
     if named.is_empty() {
         return "nothing".to_owned();
     }
-    named
-        .iter()
-        .map(|one| {
-            if one.equals.is_empty() {
-                one.id.clone()
-            } else {
-                format!("{} (or {})", one.id, one.equals.join(", "))
-            }
-        })
-        .collect::<Vec<_>>()
-        .join("; ")
+    let mut words = Vec::new();
+    for one in named {
+        let word = if one.equals.is_empty() {
+            one.id.clone()
+        } else {
+            format!("{} (or {})", one.id, one.equals.join(", "))
+        };
+        // The same in the current and in the charge view.
+        if !words.contains(&word) {
+            words.push(word);
+        }
+    }
+    words.join("; ")
 }
 
 fn required(lists: &[Vec<String>]) -> String {
@@ -321,7 +335,7 @@ fn real_table(text: &mut String, lines: &[RealLine]) {
             judged = format!("**{judged}**, confidently");
         }
         if let Some(error) = &line.error {
-            judged.push_str(&format!(" ({error})"));
+            judged.push_str(&format!(" ({})", cell(error)));
         }
         let _ = writeln!(
             text,
@@ -462,13 +476,29 @@ fn misses(text: &mut String, summary: &Summary) {
             );
         }
     }
+    let mut beaten: Vec<(&str, Vec<&str>)> = Vec::new();
     for (id, method) in &summary.beaten_on_real {
-        let _ = writeln!(text, "- {id}: {method} has the lower held-out error");
+        match beaten.last_mut() {
+            Some((last, methods)) if *last == id.as_str() => methods.push(method.as_str()),
+            _ => beaten.push((id.as_str(), vec![method.as_str()])),
+        }
+    }
+    for (id, methods) in beaten {
+        let _ = writeln!(
+            text,
+            "- {id}: lower held-out error by {}",
+            methods.join(", ")
+        );
     }
     let weak: Vec<String> = summary
         .detection
         .iter()
-        .filter(|line| line.limit.is_none_or(|limit| limit > 3.0))
+        .filter(|line| line.limit.is_none_or(|limit| limit > PLAIN))
+        .filter(|line| {
+            line.strengths
+                .iter()
+                .any(|(strength, _)| *strength == PLAIN)
+        })
         .map(|line| match line.limit {
             Some(limit) => format!("{} (from strength {limit} on)", line.effect),
             None => format!("{} (at none)", line.effect),
@@ -601,16 +631,20 @@ fn tables(summary: &Summary) -> String {
             shown(&line.covered)
         );
     }
+    text.push_str("\n## What it took\n\nSeconds of the wall clock, one processor each.\n\n| part | s |\n|---|---|\n");
+    for (part, seconds) in &summary.parts_s {
+        let _ = writeln!(text, "| {part} | {seconds:.0} |");
+    }
     if !summary.not_made.is_empty() {
         text.push_str("\n## Not made\n\nThe maker cannot have such a case (an effect of that strength on that drive); it counts nowhere.\n\n");
         for (id, why) in &summary.not_made {
-            let _ = writeln!(text, "- {id}: {}", why.lines().next().unwrap_or(""));
+            let _ = writeln!(text, "- {id}: {}", cell(why));
         }
     }
     if !summary.errors.is_empty() {
         text.push_str("\n## Failed\n\n");
         for (id, why) in &summary.errors {
-            let _ = writeln!(text, "- {id}: {}", why.lines().next().unwrap_or(""));
+            let _ = writeln!(text, "- {id}: {}", cell(why));
         }
     }
     let bad: Vec<_> = summary

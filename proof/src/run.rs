@@ -65,9 +65,19 @@ pub struct Record {
     pub methods: BTreeMap<String, Found>,
     /// Of the emulated board.
     pub calibrated: Option<Calibrated>,
+    /// Seconds of the wall clock that each part took; a batch's making is shared out.
+    pub parts_s: BTreeMap<String, f64>,
 }
 
 impl Record {
+    /// Does a part, and notes what it took.
+    fn timed<T>(&mut self, part: &str, work: impl FnOnce(&mut Self) -> T) -> T {
+        let start = Instant::now();
+        let result = work(self);
+        *self.parts_s.entry(part.to_owned()).or_insert(0.0) += start.elapsed().as_secs_f64();
+        result
+    }
+
     /// How the case went.
     pub fn judgement(&self) -> Option<Judgement> {
         let truth = self.truth.as_ref()?;
@@ -121,6 +131,32 @@ pub struct Campaign {
     pub keep: bool,
 }
 
+/// Hashes of what decides results.
+struct Sources {
+    tool: String,
+    makers: String,
+    methods: String,
+    expected: String,
+    board: String,
+}
+
+impl Sources {
+    /// Of a case: over it and what is used for it.
+    fn key(&self, planned: &Planned) -> Result<String> {
+        let mut all = serde_json::to_string(planned)?;
+        all.push_str(&self.tool);
+        all.push_str(match planned.group {
+            Group::Real => &self.expected,
+            Group::Board => &self.board,
+            _ => &self.makers,
+        });
+        if !planned.methods.is_empty() {
+            all.push_str(&self.methods);
+        }
+        Ok(hash(all.as_bytes()))
+    }
+}
+
 struct Progress {
     done: AtomicUsize,
     of: usize,
@@ -161,7 +197,7 @@ impl Campaign {
         let mut records: BTreeMap<String, Record> = BTreeMap::new();
         let mut open: Vec<(Planned, String)> = Vec::new();
         for planned in plan {
-            let key = hash(format!("{}{sources}", serde_json::to_string(planned)?).as_bytes());
+            let key = sources.key(planned)?;
             match read_record(&results, &planned.case.id) {
                 Some(record) if record.key == key => {
                     records.insert(planned.case.id.clone(), record);
@@ -216,19 +252,22 @@ impl Campaign {
             .collect()
     }
 
-    /// Over everything beside the case that decides a result.
-    fn sources(&self) -> Result<String> {
-        let mut all = hash_file(&self.tool.program)?;
-        all.push_str(&self.makers.hash()?);
-        if self.methods.there() {
-            all.push_str(&hash_of_sources(&self.methods.folder)?);
-        }
-        all.push_str(&hash_file(&self.root.join("proof/expected.toml"))?);
-        if let Some(board) = &self.board {
-            all.push_str(&hash_file(&board.emulate)?);
-            all.push_str(&hash_file(&board.image)?);
-        }
-        Ok(all)
+    /// What decides a result beside the case itself.
+    fn sources(&self) -> Result<Sources> {
+        Ok(Sources {
+            tool: hash_file(&self.tool.program)?,
+            makers: self.makers.hash()?,
+            methods: if self.methods.there() {
+                hash_of_sources(&self.methods.folder)?
+            } else {
+                String::new()
+            },
+            expected: hash_file(&self.root.join("proof/expected.toml"))?,
+            board: match &self.board {
+                Some(board) => hash_file(&board.emulate)? + &hash_file(&board.image)?,
+                None => String::new(),
+            },
+        })
     }
 
     fn batch(
@@ -240,13 +279,15 @@ impl Campaign {
         ran: &Mutex<Vec<Record>>,
     ) -> Result<()> {
         let planned: Vec<Planned> = batch.iter().map(|(planned, _)| planned.clone()).collect();
+        let start = Instant::now();
         let made = match planned[0].group {
             Group::Real => vec![self.prepare_real(&planned[0], safe)],
             Group::Board => vec![self.prepare_board(&planned[0], safe)],
             _ => self.makers.make(&planned, &self.out, safe)?,
         };
+        let made_s = start.elapsed().as_secs_f64() / batch.len() as f64;
         for ((planned, key), not_made) in batch.iter().zip(made) {
-            let record = self.case(planned, key, not_made, safe)?;
+            let record = self.case(planned, key, (not_made, made_s), safe)?;
             let path = results.join(format!("{}.json", planned.case.id));
             let part = path.with_extension("part");
             fs::write(&part, serde_json::to_string(&record)?)?;
@@ -296,7 +337,7 @@ impl Campaign {
         &self,
         planned: &Planned,
         key: &str,
-        not_made: Option<String>,
+        (not_made, made_s): (Option<String>, f64),
         safe: &Safe,
     ) -> Result<Record> {
         let id = &planned.case.id;
@@ -314,6 +355,7 @@ impl Campaign {
             overlap: None,
             methods: BTreeMap::new(),
             calibrated: None,
+            parts_s: BTreeMap::from([("make".to_owned(), made_s)]),
         };
         if record.not_made.is_some() {
             return Ok(record);
@@ -330,33 +372,41 @@ impl Campaign {
             two_clocks: folders.given.join("reference.csv").exists(),
             without: Vec::new(),
         };
-        match self.tool.explain(&folders.given, "out", &given, limit) {
+        let explained = record.timed("explain", |_| {
+            self.tool.explain(&folders.given, "out", &given, limit)
+        });
+        match explained {
             Ok(said) => record.said = Some(said),
             Err(error) => record.error = Some(format!("{error:#}")),
         }
         if planned.twice && record.said.is_some() {
-            let again = self.tool.explain(&folders.given, "again", &given, limit);
+            let again = record.timed("again", |_| {
+                self.tool.explain(&folders.given, "again", &given, limit)
+            });
             record.same = Some(again.is_ok() && same_report(&folders.given)?);
         }
-        if let Some(said) = &mut record.said {
+        if record.said.is_some() {
             let found = folders.given.join("out/model.toml");
             let designed = folders.given.join("model.toml");
-            match self.tool.held_out(
-                &folders.kept,
-                &absolute(&designed)?,
-                &absolute(&found)?,
-                given.two_clocks,
-                limit,
-            ) {
-                Ok(errors) => said.held_out = errors,
-                Err(error) => record.error = Some(format!("held out: {error:#}")),
+            let held_out = record.timed("hold out", |_| {
+                self.tool.held_out(
+                    &folders.kept,
+                    &absolute(&designed)?,
+                    &absolute(&found)?,
+                    given.two_clocks,
+                    limit,
+                )
+            });
+            match (held_out, &mut record.said) {
+                (Ok(errors), Some(said)) => said.held_out = errors,
+                (Err(error), _) => record.error = Some(format!("held out: {error:#}")),
+                (Ok(_), None) => {}
             }
         }
         for method in &planned.methods {
             if self.methods.there() {
-                record
-                    .methods
-                    .insert(method.clone(), self.methods.run(method, &folders));
+                let found = record.timed("methods", |_| self.methods.run(method, &folders));
+                record.methods.insert(method.clone(), found);
             }
         }
 
@@ -373,9 +423,10 @@ impl Campaign {
                 without: record.removed.clone(),
                 ..given
             };
-            record.without = self
-                .tool
-                .explain(&folders.given, "without", &given, limit)
+            record.without = record
+                .timed("without", |_| {
+                    self.tool.explain(&folders.given, "without", &given, limit)
+                })
                 .ok();
         }
         if let (Some(place), Some(said)) = (&truth.place, &record.said) {
@@ -385,7 +436,10 @@ impl Campaign {
         if planned.group == Group::Board
             && let Some(board) = &self.board
         {
-            match board.calibrated(&self.root, planned, &folders) {
+            let calibrated = record.timed("drive again", |_| {
+                board.calibrated(&self.root, planned, &folders)
+            });
+            match calibrated {
                 Ok(calibrated) => record.calibrated = calibrated,
                 Err(error) => record.error = Some(format!("calibrated: {error:#}")),
             }
