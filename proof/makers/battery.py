@@ -350,7 +350,11 @@ def make(case: dict, out: pathlib.Path) -> None:
             if masked:
                 before = change if before is None else before + change
     made = [recorded(case, drive, cell, stated, hidden, index) for index, drive in enumerate(drives)]
-    write_case(out, case, *made, stated.lines(SIGMA_V), truth(hidden))
+    without = recorded(case, drives[0], cell, stated, {}, 0)
+    # Against what is recorded: an offset is in the current.
+    together_v = made[0].quiet_v - without.quiet_v - (made[0].designed_v - without.designed_v)
+    combined = {"combined_strength": rms(together_v) / visible_v(1.0)}
+    write_case(out, case, *made, stated.lines(SIGMA_V), truth(hidden) | combined)
 
 
 def recorded(case: dict, drive: Drive, cell: Design, stated: Design, hidden: dict[str, Values], index: int) -> Made:
