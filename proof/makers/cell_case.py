@@ -47,7 +47,9 @@ def _recorded(drive: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def low_pass(current: np.ndarray, tau_s: float) -> np.ndarray:
-    """First order, exact for straight lines between rows, at rest before the first one."""
+    """First order, exact for straight lines between rows, at rest before the first one; 0 s: the current itself."""
+    if tau_s == 0.0:
+        return current
     kept = np.exp(-STEP_S / tau_s)
     slope = 1.0 - (1.0 - kept) * tau_s / STEP_S
     passed = lfilter([slope, 1.0 - kept - slope], [1.0, -kept], current)
@@ -56,9 +58,9 @@ def low_pass(current: np.ndarray, tau_s: float) -> np.ndarray:
 
 
 def diffusion_ladder(ohm: float, tau_s: float, terms: int = 12) -> Ladder:
-    """Z = R·tanh(√(sτ))/√(sτ) as RC branches: poles at ((k − ½)·π)²/τ."""
+    """Z = R·tanh(√(sτ))/√(sτ) as RC branches: poles at ((k − ½)·π)²/τ; what they leave acts at once."""
     poles = ((np.arange(terms) + 0.5) * np.pi) ** 2
-    return tuple((2.0 * ohm / pole, tau_s / pole) for pole in poles)
+    return (*((2.0 * ohm / pole, tau_s / pole) for pole in poles), (ohm * (1.0 - float(np.sum(2.0 / poles))), 0.0))
 
 
 @dataclasses.dataclass(frozen=True)
