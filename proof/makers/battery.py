@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 from case import rms
 from cell_case import (
-    OTHER_DRIVE, REFERENCE_C, SIGMA_V, STEP_S, ZERO_CELSIUS_K, Design, Made, drive_a, scaled, visible_v, write_case,
+    OTHER_DRIVE, REFERENCE_C, SIGMA_V, STEP_S, Design, Made, drive_a, scaled, visible_v, write_case,
 )
 from drives import RECORDINGS, coloured, stream
 
@@ -306,7 +306,8 @@ class Conceal:
         self.draw = {
             "tau1_s": between(self.random, 5.0, 60.0), "tau_s": between(self.random, 150.0, 800.0),
             "gamma": between(self.random, 30.0, 200.0), "heat_tau_s": between(self.random, 200.0, 900.0),
-            "loose_s": float(self.random.uniform(200.0, 800.0)), "step_soc": float(soc[0] + self.random.uniform(0.3, 0.7) * (soc[-1] - soc[0])),
+            "loose_s": float(self.random.uniform(200.0, 800.0)),
+            "step_soc": float(soc[0] + self.random.uniform(0.3, 0.7) * (soc[-1] - soc[0])),
         }
         self.plain = voltage(drive, cell, {})
 

@@ -1,4 +1,4 @@
-"""Cells simulated by PyBaMM, a simulator that others wrote (kind b): single-particle (SPMe) and Doyle–Fuller–Newman (DFN) models.
+"""Cells simulated by PyBaMM, a simulator that others wrote (kind b): single-particle (SPMe) and Doyle–Fuller–Newman (DFN).
 
 The cell is PyBaMM's in every respect. What is concealed is a part of its physics, or a flaw of the way in which its current is
 recorded. The model file is what a user has of such a cell: its open-circuit voltage, its instantaneous resistance, its capacity.
@@ -16,7 +16,11 @@ Options of a case: `model` "spme" or "dfn"; `parameters` a PyBaMM set of LG M50;
 
 import dataclasses
 import functools
+import os
 import pathlib
+
+# PyBaMM asks on its first import whether it may report what it is used for, and a campaign has nobody to answer.
+os.environ.setdefault("PYBAMM_DISABLE_TELEMETRY", "true")
 
 import numpy as np
 import pybamm
@@ -24,13 +28,14 @@ from scipy.optimize import least_squares, nnls
 
 from case import rms
 from cell_case import (
-    OTHER_DRIVE, REFERENCE_C, SIGMA_V, STEP_S, ZERO_CELSIUS_K, Design, Made, diffusion_ladder, drive_a, low_pass, scaled, visible_v, write_case,
+    OTHER_DRIVE, REFERENCE_C, SIGMA_V, STEP_S, ZERO_CELSIUS_K, Design, Made, diffusion_ladder, drive_a, low_pass, scaled,
+    visible_v, write_case,
 )
 from drives import stream
 
 INITIAL_SOC = 0.85
-DESIGN_START_S = 1800.0
-"""The equivalent circuit is fitted to US06 from here on."""
+DESIGN_START_S, DESIGN_ROWS = 3000.0, 3600
+"""The equivalent circuit is fitted to US06 from here on: driving that 6000 rows of a case do not reach."""
 SWING_PERIOD_S = 2000.0
 TEMPERATURE_NOISE_K = 0.05
 HYSTERESIS_DECAY = 100.0
@@ -63,7 +68,7 @@ class Cell:
     temperature_c, swing_k : surroundings in °C, and by how much they go down and come back, in K.
     transfer_w_m2_k : heat transfer coefficient of a lumped cell.
     hysteresis_v : the negative electrode's open-circuit potential lies between that ± this, one-state model (Axen 2022).
-    entropic_v_per_k : entropic change of the positive electrode; not a number: as the parameter set has it.
+    entropic_v_per_k : entropic change of the positive electrode.
     frozen : reaction rates do not follow temperature.
     """
 
@@ -147,9 +152,10 @@ def run(cell: Cell, values: pybamm.ParameterValues, t_s: np.ndarray) -> tuple[np
 
 @functools.lru_cache(maxsize=16)
 def equilibrium(parameters: str) -> tuple[float, bytes]:
-    """Capacity in Ah between the parameter set's voltage limits, and the open-circuit voltage over state of charge (table as bytes)."""
+    """Capacity in Ah between the set's voltage limits, and its open-circuit voltage over state of charge (a table as bytes)."""
     values = pybamm.ParameterValues(parameters)
-    empty_n, full_n, full_p, empty_p = (float(x) for x in pybamm.lithium_ion.get_min_max_stoichiometries(values))
+    limits = pybamm.lithium_ion.get_min_max_stoichiometries(values)
+    empty_n, full_n, full_p, empty_p = (float(x) for x in limits)
     symbols = pybamm.LithiumIonParameters()
     soc = np.linspace(0.0, 1.0, 201)
     kelvin = pybamm.Scalar(REFERENCE_C + ZERO_CELSIUS_K)
@@ -185,15 +191,15 @@ def bare_design(cell: Cell) -> Design:
 
 
 @functools.lru_cache(maxsize=16)
-def circuit_design(cell: Cell, rows: int, thermal_law: bool) -> Design:
+def circuit_design(cell: Cell, thermal_law: bool) -> Design:
     """An equivalent circuit of the cell: resistance, two branches, diffusion; fitted where the campaign does not look.
 
     With `thermal_law` the cell is driven through a swing of temperature, and the Arrhenius temperature is fitted too.
     """
     bare = bare_design(cell)
     driven = dataclasses.replace(cell, thermal="isothermal", swing_k=15.0 if thermal_law else 0.0)
-    current_a = cell.scale * drive_a("us06", rows, DESIGN_START_S)
-    voltage, temp_c = solved(driven, "us06", rows, DESIGN_START_S)
+    current_a = cell.scale * drive_a("us06", DESIGN_ROWS, DESIGN_START_S)
+    voltage, temp_c = solved(driven, "us06", DESIGN_ROWS, DESIGN_START_S)
     drop = bare.open_circuit_v(bare.soc(current_a)) - voltage
 
     def columns(guess: np.ndarray) -> np.ndarray:
@@ -291,7 +297,7 @@ class Conceal:
 
     def physical(self, effect: str, strength: float) -> float:
         """Size of an effect of the cell's physics."""
-        plain = solved(with_physics(self.cell, effect, 1e-9) if effect == "cell-self-heating" else self.cell, self.drive, self.rows)[0]
+        plain = solved(self.cell, self.drive, self.rows)[0]
 
         def change_v(size: float) -> float:
             return rms(solved(with_physics(self.cell, effect, size), self.drive, self.rows)[0] - plain)
@@ -334,7 +340,7 @@ def make(case: dict, out: pathlib.Path) -> None:
     cell = base_cell(case)
     relaxed = design_of(case)
     design = bare_design(cell) if relaxed == "ocv-resistance" else circuit_design(
-        dataclasses.replace(cell, swing_k=0.0, temperature_c=REFERENCE_C), case["rows"], "cell-self-heating" in ids)
+        dataclasses.replace(cell, swing_k=0.0, temperature_c=REFERENCE_C), "cell-self-heating" in ids)
     find = Conceal(case, design, cell)
     sizes: dict[str, float] = {}
     stated = design
