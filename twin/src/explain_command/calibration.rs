@@ -97,7 +97,21 @@ pub(super) fn calibrate(model: &Model, report: &Report) -> Calibration {
         let had = had.map(|effect| (effect, false));
         let named = named.cloned().map(|effect| (effect, true));
         for ((id, parameters), is_new) in had.chain(named) {
-            match remedy(model, signal, &id, &parameters.into_iter().collect()) {
+            let remedy = remedy(model, signal, &id, &parameters.into_iter().collect());
+            let said = report
+                .effects
+                .iter()
+                .find(|effect| is_new && effect.id == id && effect.signal == signal);
+            if let Some(class) = said.map(|effect| &effect.equivalent_to)
+                && !class.is_empty()
+                && !matches!(remedy, Remedy::None(_))
+            {
+                remarks.push(format!(
+                    "{id} in {signal} could as well be {}: the registers correct it only if it is {id}.",
+                    class.join(" or ")
+                ));
+            }
+            match remedy {
                 Remedy::Lines(both) => {
                     for (line, (slope, zero_a)) in lines.iter_mut().zip(both) {
                         *line = line.then(slope, zero_a);
@@ -270,4 +284,164 @@ fn register(
         "[[register]]\nname = \"{name}\"\naddress = 0x{:04X}\nunit = \"{unit}\"\n{values}",
         field.layout.address
     ))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::report::data::{EffectReport, FittedModel, Inputs, Verdict};
+
+    const BOARD: &str = "schema = 1\n[sensor]\nfront_end = \"dual-range\"\n[charge]\n";
+
+    /// The file's values by name, and the remarks, after these effects were found.
+    fn found(effects: &[(&str, &str, &[(&str, f64)])]) -> (toml::Table, Vec<String>) {
+        let model = Model::parse("m.toml", BOARD.to_owned(), Path::new("")).unwrap();
+        let mut report = Report {
+            schema: 1,
+            verdict: Verdict::Explained,
+            summary: String::new(),
+            signals: Vec::new(),
+            locations: Vec::new(),
+            effects: Vec::new(),
+            holdouts: Vec::new(),
+            unexplained: Vec::new(),
+            decisions: Vec::new(),
+            remarks: Vec::new(),
+            seconds: 0.0,
+            seed: 0,
+            version: String::new(),
+            inputs: Inputs::default(),
+            models: Vec::new(),
+            plots: Vec::new(),
+        };
+        for (signal, id, values) in effects {
+            report.effects.push(EffectReport {
+                id: (*id).to_owned(),
+                signal: (*signal).to_owned(),
+                statement: String::new(),
+                equation: String::new(),
+                parameters: Vec::new(),
+                held_out_gain: 0.5,
+                placebo_p99: 0.0,
+                equivalent_to: Vec::new(),
+                separated_by: String::new(),
+                consequences: Vec::new(),
+            });
+            let values = values
+                .iter()
+                .map(|(name, value)| ((*name).to_owned(), *value));
+            report.models.push(FittedModel {
+                signal: (*signal).to_owned(),
+                effects: vec![((*id).to_owned(), values.collect())],
+                ..FittedModel::default()
+            });
+        }
+        let calibration = calibrate(&model, &report);
+        let table: toml::Table = calibration.text.unwrap_or_default().parse().unwrap();
+        let mut values = toml::Table::new();
+        for register in table
+            .get("register")
+            .into_iter()
+            .flat_map(|all| all.as_array().unwrap())
+        {
+            values.insert(
+                register["name"].as_str().unwrap().to_owned(),
+                register.clone(),
+            );
+        }
+        (values, calibration.remarks)
+    }
+
+    #[test]
+    fn a_correction_undoes_the_sensor() {
+        let (values, remarks) = found(&[
+            (
+                "i_meas_a",
+                "range-mismatch",
+                &[("gain_ratio", 1.02), ("offset_a", 0.51)],
+            ),
+            ("q_meas_c", "offset", &[("offset_a", -0.2)]),
+        ]);
+        let of = |name: &str, key: &str| values[name][key].as_integer().unwrap() as f64 * 1e-6;
+        // The board's own formula, at 100 A.
+        let reading = 1.02 * 100.0 + 0.51;
+        let corrected = (1.0 + of("current gain", "large")) * reading - of("zero drift", "large");
+        assert!((corrected - 100.0).abs() < 1e-3, "{corrected}");
+        assert_eq!(of("current gain", "small"), 0.0);
+        assert_eq!(of("zero drift", "small"), 0.0);
+        assert_eq!(
+            values["meter: offset"]["small"].as_integer(),
+            Some(-200_000)
+        );
+        assert_eq!(
+            values["meter: offset"]["large"].as_integer(),
+            Some(-200_000)
+        );
+        assert!(remarks.is_empty(), "{remarks:?}");
+    }
+
+    #[test]
+    fn supply_and_hand_over_have_registers_of_their_own() {
+        let (values, _) = found(&[
+            ("i_meas_a", "supply-ratiometric", &[("ratio", 0.97)]),
+            (
+                "q_meas_c",
+                "range-handover",
+                &[("tau_s", 60e-6), ("since_s", 0.0)],
+            ),
+        ]);
+        assert_eq!(
+            values["converter: supply mode"]["value"].as_integer(),
+            Some(1)
+        );
+        assert_eq!(
+            values["meter: front-end delay"]["value"].as_integer(),
+            Some(60)
+        );
+    }
+
+    #[test]
+    fn what_the_board_cannot_do_is_said_and_not_written() {
+        let (values, remarks) = found(&[
+            ("i_meas_a", "lag", &[("tau_s", 0.1)]),
+            // The multiplier's low-pass: longer than the register holds.
+            (
+                "q_meas_c",
+                "range-handover",
+                &[("tau_s", 0.0179), ("since_s", 0.0)],
+            ),
+        ]);
+        assert!(values.is_empty(), "{values:?}");
+        assert_eq!(remarks.len(), 2, "{remarks:?}");
+        assert!(
+            remarks[0].contains("17900") && remarks[0].contains("10000"),
+            "{remarks:?}"
+        );
+        assert!(remarks[1].contains("cannot correct lag"), "{remarks:?}");
+        // Beyond the limit that the zero drift has by itself; the gain stays.
+        let (values, remarks) = found(&[(
+            "i_meas_a",
+            "range-mismatch",
+            &[("gain_ratio", 1.01), ("offset_a", 9.0)],
+        )]);
+        assert_eq!(values.len(), 1, "{values:?}");
+        assert!(remarks[0].contains("zero drift"), "{remarks:?}");
+    }
+
+    #[test]
+    fn every_effect_of_the_library_has_a_register_or_a_reason() {
+        let model = Model::parse("m.toml", BOARD.to_owned(), Path::new("")).unwrap();
+        for id in crate::effects::ids() {
+            for signal in ["i_meas_a", "q_meas_c", "v_cell_v"] {
+                match remedy(&model, signal, id, &BTreeMap::new()) {
+                    Remedy::Register((name, _)) => assert!(setting(name).is_some(), "{name}"),
+                    Remedy::None(why) => assert!(why.len() > 10, "{id}"),
+                    Remedy::Lines(_) => {}
+                }
+            }
+        }
+    }
 }
