@@ -34,6 +34,8 @@ const LEFT: f64 = 0.04;
 const STRUCTURE: f64 = 0.1;
 /// What remains is too loud from this multiple of the stated noise on.
 const LOUD: f64 = 1.3;
+/// Where no noise is stated, a mismatch is more than noise with a memory from this multiple of its jumps on.
+const SLOW: f64 = 10.0;
 /// Where no effect passes, loudness is judged by this share of the residual's sizes, which is so many standard deviations of a
 /// normal distribution: single readings at wrong moments are no unknown physics.
 const COMMON: (f64, f64) = (0.8, 1.2816);
@@ -409,11 +411,20 @@ fn judge(
     let noise = bench.problem.noise;
     let known = noise.max(bench.problem.accuracy.zero);
     if selection.named.is_empty() {
-        let common = quantile(&selection.plain.residual, COMMON.0) / COMMON.1;
-        return if noise > 0.0 && common > LOUD * known {
+        let residual = &selection.plain.residual;
+        let common =
+            (quantile(residual, COMMON.0) / COMMON.1).min(rms(residual.iter().copied()));
+        // What the readings jump by from one to the next is the most that noise without a memory can be.
+        let (floor, times, of) = if noise > 0.0 {
+            (known, LOUD, "the noise that the model file states")
+        } else {
+            let jumps = fit::spread(&jumps(residual)) / std::f64::consts::SQRT_2;
+            (known.max(jumps), SLOW, "what it changes from reading to reading")
+        };
+        return if floor > 0.0 && common > times * floor {
             selection.decisions.push(format!(
-                "No effect passes, yet all over the recording the mismatch is {} times the noise that the model file states: unknown.",
-                short(common / noise)
+                "No effect passes, yet all over the recording the mismatch is {} times {of}: unknown.",
+                short(common / floor)
             ));
             Verdict::Unknown
         } else if before.is_real() && before.share > STRUCTURE {

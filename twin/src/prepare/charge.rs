@@ -63,7 +63,12 @@ pub(super) fn item(
         ));
     }
     let spacing_s = series::spacing_s(&observed).max(f64::MIN_POSITIVE);
-    let noise_c = (spec.noise_c.powi(2) + step_c * step_c / 12.0).sqrt();
+    let squares: f64 = drive.reference.iter().map(|i| i * i).sum();
+    let typical_a = (squares / drive.len().max(1) as f64).sqrt();
+    // Steps and uncertain moments are spread evenly: the variance of a width is its square by twelve.
+    let noise_c = (spec.noise_c.powi(2)
+        + (step_c.powi(2) + (typical_a * spec.jitter_s).powi(2)) / 12.0)
+        .sqrt();
     let mut base = SensorBase {
         // A counter has no window of its own.
         step: step_c / spacing_s,
