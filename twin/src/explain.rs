@@ -44,6 +44,8 @@ const ALIKE: f64 = 0.35;
 /// From this ratio of what is left explainable to what the named effects explain on, their names are not to be trusted: another
 /// physics of the same shape would leave as much.
 const DOUBTFUL: f64 = 0.12;
+/// Below this ratio it is traces, wherever they sit: even a true effect's equation is a model.
+const TRACES: f64 = 0.02;
 /// An effect that makes the error in another file larger by this factor is not that file's physics.
 const WORSE: f64 = 1.05;
 /// A file that was never fitted confirms the effects if they bring its error down to this share.
@@ -493,7 +495,7 @@ fn judge(
         } else {
             0.0
         };
-        if !confirmed && (ratio > DOUBTFUL || alike > ALIKE) {
+        if !confirmed && (ratio > DOUBTFUL || (alike > ALIKE && ratio > TRACES)) {
             let ids = selection.fit.model.ids().join(", ");
             selection.refused.push(format!(
                 "{ids}: the best of the library, but so much structure is left, and where these effects act, that the true physics is likely another"
