@@ -36,6 +36,10 @@ impl Effect for Delay {
             .collect()
     }
 
+    fn idealised(&self) -> f64 {
+        0.0
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         scene.delay_s += values[0];
     }

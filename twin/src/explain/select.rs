@@ -154,7 +154,13 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
             Some(better) if rounds < 3 => now = better,
             _ => {
                 progress(0.92, "asking which other effects would do as well");
-                let now = polish(bench, &now);
+                let mut now = polish(bench, &now);
+                let mut others = others;
+                // The last exchange may have made another one needless.
+                if let Some(leaner) = backward(bench, &now, &step_p99, &mut decisions) {
+                    now = polish(bench, &leaner);
+                    others = swapped(bench, &now);
+                }
                 let named = name(bench, &now, &others, &step_p99);
                 // Small, and as well explained by many others: that is structure, and no name.
                 let Some(vague) = named
@@ -402,6 +408,15 @@ fn obstacle(
             percent(FLOOR)
         ));
     }
+    let beside = beside(bench, after, index);
+    let all: f64 = change.iter().map(|c| c * c).sum();
+    if all < beside {
+        return Some(format!(
+            "{:.2} rms, which the equations of the others may be off by ({:.2})",
+            (all / bench.len() as f64).sqrt(),
+            (beside / bench.len() as f64).sqrt()
+        ));
+    }
     let deviations = bench.deviations(&change);
     if deviations < CERTAIN {
         return Some(format!(
@@ -455,6 +470,29 @@ fn obstacle(
         }
     }
     None
+}
+
+/// Energy by which the other effects' equations may be off.
+fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
+    let members = &fit.model.members;
+    (0..members.len())
+        .filter(|other| *other != index)
+        .map(|other| {
+            let share = members[other].effect.idealised();
+            if share == 0.0 {
+                return 0.0;
+            }
+            let without = bench.run(&fit.model.without(other));
+            let energy: f64 = fit
+                .predicted
+                .iter()
+                .zip(&without)
+                .map(|(with, without)| (with - without).powi(2))
+                .filter(|change| change.is_finite())
+                .sum();
+            share * share * energy
+        })
+        .sum()
 }
 
 /// Two effects that hide each other: neither passes alone, both together do.
