@@ -348,6 +348,7 @@ impl Accumulator {
     }
 
     /// To the nearest nC.
+    #[inline(never)]
     const fn rounded(&self) -> Nanocoulombs {
         Nanocoulombs(
             self.whole
