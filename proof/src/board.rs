@@ -166,11 +166,13 @@ impl Board {
             maker: "own emulator, unmodified image".to_owned(),
             effects: vec![TrueEffect {
                 id: error.effect.to_owned(),
-                parameters: error
-                    .parameters
-                    .iter()
-                    .map(|(name, value)| ((*name).to_owned(), Some(*value)))
-                    .collect(),
+                parameters: Some(
+                    error
+                        .parameters
+                        .iter()
+                        .map(|(name, value)| ((*name).to_owned(), Some(*value)))
+                        .collect(),
+                ),
             }],
             required: error.required.iter().map(|ids| words(ids)).collect(),
             allowed: words(error.allowed),

@@ -46,7 +46,7 @@ const BATTERY: [&str; 10] = [
 ];
 
 /// Around the detection limit: 1 is just visible.
-pub const STRENGTHS: [f64; 5] = [0.3, 1.0, 3.0, 10.0, 30.0];
+const STRENGTHS: [f64; 5] = [0.3, 1.0, 3.0, 10.0, 30.0];
 /// What is added to the reading.
 const NOISES: [&str; 3] = ["white", "coloured", "quantised"];
 /// A car on a fast and on a slow cycle, and the switched load of a computer.
@@ -141,7 +141,7 @@ const COMBINED: [&[&str]; 10] = [
 ];
 
 /// What people use today, by the names of proof/methods/run.py.
-pub const METHODS: [&str; 7] = [
+const METHODS: [&str; 7] = [
     "straight-line",
     "bic",
     "bic-ar1",
@@ -383,6 +383,11 @@ fn cells() -> Vec<Planned> {
     plan
 }
 
+/// These show in few rows or none until they are large (proof/makers/README.md).
+const LATE: [&str; 2] = ["sampled-window", "range-handover"];
+/// For them.
+const LATE_STRENGTHS: [f64; 2] = [100.0, 300.0];
+
 /// Each effect × strength × noise × drive of the sensing chain.
 fn single_sensing() -> Vec<Planned> {
     let mut plan = Vec::new();
@@ -404,6 +409,15 @@ fn single_sensing() -> Vec<Planned> {
                     "us06-fast",
                     3,
                     ROWS,
+                ));
+            }
+        }
+    }
+    for effect in LATE {
+        for strength in LATE_STRENGTHS {
+            for (place, drive) in CELL_DRIVES.into_iter().enumerate() {
+                plan.push(single(
+                    "sensing", effect, strength, "white", drive, place, ROWS,
                 ));
             }
         }

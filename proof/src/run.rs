@@ -411,8 +411,13 @@ impl Campaign {
         }
 
         let opened = safe.unseal(id, &record.truth_sha256)?;
-        let truth: Truth =
-            serde_json::from_str(&opened).with_context(|| format!("the truth of {id}"))?;
+        let truth: Truth = match serde_json::from_str(&opened) {
+            Ok(truth) => truth,
+            Err(error) => {
+                record.not_made = Some(format!("truth.json: {error}"));
+                return Ok(record);
+            }
+        };
         if planned.without {
             record.removed = truth
                 .effects
