@@ -254,10 +254,10 @@ Aline{index} in l{index} line{index}
 
 
 def delay(size: float) -> Circuit:
-    """A matched transmission line."""
+    """A matched transmission line. With steps much longer than its delay ngspice gives up."""
     delay_s = 0.01 * size
     return Circuit(f"Rs in near 50\nT1 near 0 out 0 Z0=50 TD={delay_s:.9g}\nRt out 0 50", 2.0 * A_PER_V,
-                   {"delay": {"delay_s": delay_s}})
+                   {"delay": {"delay_s": delay_s}}, step_s=min(0.05, max(2.0 * delay_s, 0.003)))
 
 
 def moving_average(size: float) -> Circuit:
@@ -282,15 +282,15 @@ def sampled_window(_: float) -> Circuit:
     Of one size: with a period of less than some rows nobody could see it.
     """
     period_s, duty = 0.37, 0.45
-    open_s, short_s = duty * period_s, 0.01 * period_s
-    edge_s = 1e-3 * period_s
+    open_s, short_s = duty * period_s, 0.002 * period_s
+    edge_s = 2e-4 * period_s
     first_s = LEAD_S % period_s
 
     def pulse(from_s: float, length_s: float) -> str:
         return f"PULSE(0 1 {first_s + from_s:.9g} {edge_s:.9g} {edge_s:.9g} {length_s - edge_s:.9g} {period_s:.9g})"
 
     return Circuit(f"""
-.model gate SW(VT=0.5 VH=0.1 RON=10 ROFF=1e12)
+.model gate SW(VT=0.5 VH=0.1 RON=50 ROFF=1e12)
 Vopen open 0 {pulse(0.0, open_s)}
 Vhand hand 0 {pulse(open_s + short_s, short_s)}
 Vreset reset 0 {pulse(open_s + 3.0 * short_s, short_s)}
