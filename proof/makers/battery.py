@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 from case import rms
 from cell_case import (
-    OTHER_DRIVE, REFERENCE_C, SIGMA_V, STEP_S, ZERO_CELSIUS_K, Design, Made, drive_a, scaled, visible_v, write_case,
+    OTHER_DRIVE, REFERENCE_C, SIGMA_V, STEP_S, Design, Made, drive_a, scaled, visible_v, write_case,
 )
 from drives import RECORDINGS, coloured, stream
 
@@ -306,7 +306,8 @@ class Conceal:
         self.draw = {
             "tau1_s": between(self.random, 5.0, 60.0), "tau_s": between(self.random, 150.0, 800.0),
             "gamma": between(self.random, 30.0, 200.0), "heat_tau_s": between(self.random, 200.0, 900.0),
-            "loose_s": float(self.random.uniform(200.0, 800.0)), "step_soc": float(soc[0] + self.random.uniform(0.3, 0.7) * (soc[-1] - soc[0])),
+            "loose_s": float(self.random.uniform(200.0, 800.0)),
+            "step_soc": float(soc[0] + self.random.uniform(0.3, 0.7) * (soc[-1] - soc[0])),
         }
         self.plain = voltage(drive, cell, {})
 
@@ -350,7 +351,11 @@ def make(case: dict, out: pathlib.Path) -> None:
             if masked:
                 before = change if before is None else before + change
     made = [recorded(case, drive, cell, stated, hidden, index) for index, drive in enumerate(drives)]
-    write_case(out, case, *made, stated.lines(SIGMA_V), truth(hidden))
+    without = recorded(case, drives[0], cell, stated, {}, 0)
+    # Against what is recorded: an offset is in the current.
+    together_v = made[0].quiet_v - without.quiet_v - (made[0].designed_v - without.designed_v)
+    combined = {"combined_strength": rms(together_v) / visible_v(1.0)}
+    write_case(out, case, *made, stated.lines(SIGMA_V), truth(hidden) | combined)
 
 
 def recorded(case: dict, drive: Drive, cell: Design, stated: Design, hidden: dict[str, Values], index: int) -> Made:

@@ -1,6 +1,7 @@
 """What all cases of a cell have in common: the drive, noise, the model as designed, the files, the truth."""
 
 import dataclasses
+import functools
 import json
 import pathlib
 
@@ -18,6 +19,8 @@ WHITE_BESIDE = 0.3
 STEP_S = 0.5
 """Time between rows; the current goes in straight lines between them."""
 REFERENCE_C, ZERO_CELSIUS_K = 25.0, 273.15
+FEWEST, MOST = 200, 8000
+"""Rows of a case: US06 empties the cell soon after the most."""
 TRIES = 8
 """So often the size of an effect is tried."""
 OTHER_DRIVE = {"us06": "hwfet", "hwfet": "us06"}
@@ -30,13 +33,23 @@ def drive_a(drive: str, rows: int, start_s: float = 0.0) -> np.ndarray:
     """Current of the Panasonic cell in A, positive = discharge, on rows STEP_S apart; the cycle repeats if the file ends."""
     if drive not in OTHER_DRIVE:
         raise ValueError(f"drive: expected one of {', '.join(OTHER_DRIVE)}, found {drive!r}")
-    table = np.genfromtxt(RECORDINGS / f"panasonic-18650pf/25c-{drive}.csv", delimiter=",", names=True, usecols=("t_s", "i_ref_a"))
+    if not FEWEST <= rows <= MOST:
+        raise ValueError(f"rows: expected {FEWEST} to {MOST}, found {rows}")
+    known_s, known_a = _recorded(drive)
     t_s = start_s + np.arange(rows) * STEP_S
-    return np.interp(np.mod(t_s, table["t_s"][-1]), table["t_s"], table["i_ref_a"])
+    return np.interp(np.mod(t_s, known_s[-1]), known_s, known_a)
+
+
+@functools.cache
+def _recorded(drive: str) -> tuple[np.ndarray, np.ndarray]:
+    table = np.genfromtxt(RECORDINGS / f"panasonic-18650pf/25c-{drive}.csv", delimiter=",", names=True, usecols=("t_s", "i_ref_a"))
+    return table["t_s"], table["i_ref_a"]
 
 
 def low_pass(current: np.ndarray, tau_s: float) -> np.ndarray:
-    """First order, exact for straight lines between rows, at rest before the first one."""
+    """First order, exact for straight lines between rows, at rest before the first one; 0 s: the current itself."""
+    if tau_s == 0.0:
+        return current
     kept = np.exp(-STEP_S / tau_s)
     slope = 1.0 - (1.0 - kept) * tau_s / STEP_S
     passed = lfilter([slope, 1.0 - kept - slope], [1.0, -kept], current)
@@ -45,9 +58,9 @@ def low_pass(current: np.ndarray, tau_s: float) -> np.ndarray:
 
 
 def diffusion_ladder(ohm: float, tau_s: float, terms: int = 12) -> Ladder:
-    """Z = R·tanh(√(sτ))/√(sτ) as RC branches: poles at ((k − ½)·π)²/τ."""
+    """Z = R·tanh(√(sτ))/√(sτ) as RC branches: poles at ((k − ½)·π)²/τ; what they leave acts at once."""
     poles = ((np.arange(terms) + 0.5) * np.pi) ** 2
-    return tuple((2.0 * ohm / pole, tau_s / pole) for pole in poles)
+    return (*((2.0 * ohm / pole, tau_s / pole) for pole in poles), (ohm * (1.0 - float(np.sum(2.0 / poles))), 0.0))
 
 
 @dataclasses.dataclass(frozen=True)
