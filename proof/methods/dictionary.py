@@ -245,9 +245,9 @@ def timing_entries(recording: Series) -> list[Entry]:
     """What depends on the past of the signal."""
     step = recording.step_s
     last = max(min(recording.span_s / 8, 500 * step), 4 * step)
-    out = spread("lag", lag, "tau_s", times(step / 4, last, 2.2), positive=True)
-    out += spread("moving-average", average, "window_s", times(step / 2, last, 2.2), positive=True)
-    out += spread("delay", delay, "delay_s", times(step / 8, max(last / 4, step), 2.2))
+    out = spread("lag", lag, "tau_s", times(step / 12, last, 2.2), positive=True)
+    out += spread("moving-average", average, "window_s", times(step / 6, last, 2.2), positive=True)
+    out += spread("delay", delay, "delay_s", times(step / 20, max(last / 4, step), 2.2))
     for build in (skew_fast, skew_slow):
         out += spread("clock-skew", build, "skew_ppm", 1e6 / elapsed(recording) * times(step / 8, 5 * step, 2.0), positive=True)
     for duty in (0.2, 0.5, 0.8):

@@ -22,7 +22,7 @@ MEMORY_S = (10.0, 100.0)
 
 
 def fit(recording: Series) -> Fitted:
-    """Two kernels (with and without a straight line), the likelier one taken; length scales by maximum likelihood."""
+    """Two kernels, with and without a straight line: length scales by maximum likelihood, the better one on rows not used."""
     inputs = features(recording, recording.step_s)
     rows = np.flatnonzero(recording.valid)
     centre, scale = inputs[rows].mean(axis=0), inputs[rows].std(axis=0)
@@ -40,18 +40,23 @@ def fit(recording: Series) -> Fitted:
 
     smooth = ConstantKernel(1.0, (1e-3, 1e3)) * RBF(np.full(used.sum(), 2.0), (0.05, 1e3))
     straight = ConstantKernel(0.1, (1e-6, 1e3)) * DotProduct(1.0, (1e-2, 1e2))
-    noise = WhiteKernel(0.3, (1e-5, 2.0))
+    noise = WhiteKernel(0.3, (1e-3, 2.0))
     starts = (smooth + noise, smooth + straight + noise)
-    tried = [train(kernel, POINTS_FOR_SCALES, "fmin_l_bfgs_b") for kernel in starts]
-    best = max(tried, key=lambda process: process.log_marginal_likelihood_value_)
-    process = train(best.kernel_, POINTS, None)
+    tried = [train(train(kernel, POINTS_FOR_SCALES, "fmin_l_bfgs_b").kernel_, POINTS, None) for kernel in starts]
+    others = np.setdiff1d(rows, thinned(rows, POINTS))
+    others = thinned(others if len(others) else rows, POINTS)
+
+    def loss(process: GaussianProcessRegressor) -> float:
+        return float(np.sum((level + size * process.predict(standardised(inputs[others])) - target[others]) ** 2))
+
+    process = min(tried, key=loss)
 
     def predict(series: Series) -> Array:
         values = standardised(features(series, recording.step_s))
         parts = [process.predict(values[k : k + 4000]) for k in range(0, len(values), 4000)]
         return level + size * np.concatenate(parts)
 
-    note = f"{min(POINTS, len(rows))} of {len(rows)} rows; kernel {best.kernel_}"
+    note = f"{min(POINTS, len(rows))} of {len(rows)} rows; kernel {process.kernel_}"
     return Fitted([], predict, None, note)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
-from filters import by_segment, boxcar
+from filters import boxcar, by_segment, diffusion, low_pass
 
 Array = np.ndarray
 
@@ -20,6 +20,9 @@ HELD = {
     "i_aux_a": "aux",
     "range_high": "range_high",
 }
+
+# Effects that a battery's design may already hold.
+KNOWN = ("polarisation", "diffusion", "resistance-temperature")
 
 
 @dataclass
@@ -54,6 +57,8 @@ class Series:
     # Whatever else was recorded: temperature_c, supply_v, aux, range_high; soc (0 … 1), slope_v (dOCV/dSoC).
     other: dict[str, Array] = field(default_factory=dict)
     battery: Battery | None = None
+    # OCV(SoC) − R·i alone, in V (battery).
+    static: Array | None = None
     full_scale: float = 0.0
     resolution: float = 0.0
     noise: float = 0.0
@@ -75,8 +80,9 @@ def load(folder: pathlib.Path) -> tuple[Series, Series]:
     """Reads recording and held-out recording of a folder."""
     path = folder / "model.toml"
     model = tomllib.loads(path.read_text(encoding="utf-8"))
-    if model.get("effects"):
-        raise ValueError(f"{path}: the methods start from the design; it must hold no [effects]")
+    for effect in model.get("effects", {}):
+        if "battery" not in model or "sensor" in model or effect not in KNOWN:
+            raise ValueError(f"{path}: effects.{effect}: the methods know {', '.join(KNOWN)} of a battery as part of a design")
     return tuple(read(folder / name, model) for name in ("recording.csv", "holdout.csv"))
 
 
@@ -88,7 +94,7 @@ def read(path: pathlib.Path, model: dict) -> Series:
         table[name] = sign * table[column.lstrip("-")]
     segments = split(table)
     if "battery" in model and "sensor" not in model:
-        return battery_series(path, table, segments, model["battery"])
+        return battery_series(path, table, segments, model["battery"], model.get("effects", {}))
     return sensor_series(path, table, segments, model.get("sensor", {}))
 
 
@@ -136,8 +142,8 @@ def sensor_series(path: pathlib.Path, table: pd.DataFrame, segments: list[slice]
     )
 
 
-def battery_series(path: pathlib.Path, table: pd.DataFrame, segments: list[slice], settings: dict) -> Series:
-    """A cell's voltage beside OCV(SoC) − R·i, the state of charge counted from the current."""
+def battery_series(path: pathlib.Path, table: pd.DataFrame, segments: list[slice], settings: dict, known: dict) -> Series:
+    """A cell's voltage beside OCV(SoC) − R·i (and what else is known), the state of charge counted from the current."""
     battery = read_battery(path, settings)
     column = settings.get("current", "i_ref_a" if "i_ref_a" in table else "i_meas_a")
     voltage = "v_cell_v" if "v_cell_v" in table else "v_pack_v"
@@ -150,7 +156,7 @@ def battery_series(path: pathlib.Path, table: pd.DataFrame, segments: list[slice
     soc = count(t_s, x, battery.capacity_ah, float(settings.get("efficiency", 1.0)))
     soc += initial_soc(settings, battery, reading, x, valid)
     ocv_v = np.interp(soc, battery.ocv_soc, battery.ocv_v)
-    simulated = battery.cells * (ocv_v - battery.resistance_ohm * x)
+    static = battery.cells * (ocv_v - battery.resistance_ohm * x)
     step = 0.005
     slope = np.interp(soc + step, battery.ocv_soc, battery.ocv_v) - np.interp(soc - step, battery.ocv_soc, battery.ocv_v)
     other = {"soc": soc, "slope_v": battery.cells * slope / (2 * step)}
@@ -158,6 +164,7 @@ def battery_series(path: pathlib.Path, table: pd.DataFrame, segments: list[slice
         if name in table and table[name].notna().any():
             other["temperature_c"] = table[name].ffill().bfill().to_numpy(float)
             break
+    simulated = static - battery.cells * known_drop(t_s, x, segments, battery, known, other.get("temperature_c"))
     return Series(
         kind="battery",
         t_s=t_s,
@@ -169,7 +176,26 @@ def battery_series(path: pathlib.Path, table: pd.DataFrame, segments: list[slice
         valid=valid,
         other=other,
         battery=battery,
+        static=static,
     )
+
+
+def known_drop(
+    t_s: Array, x: Array, segments: list[slice], battery: Battery, known: dict, temperature_c: Array | None
+) -> Array:
+    """Voltage of one cell, in V, that falls beyond the ohmic drop at 25 °C by the effects that the design holds."""
+    drop = np.zeros(len(x))
+    branches = known.get("polarisation", {})
+    for number in (1, 2, 3):
+        if f"tau{number}_s" in branches:
+            slow = by_segment(low_pass, segments, t_s, x, branches[f"tau{number}_s"], 0.0)
+            drop += branches[f"r{number}_ohm"] * slow
+    if "diffusion" in known:
+        drop += known["diffusion"]["r_ohm"] * by_segment(diffusion, segments, t_s, x, known["diffusion"]["tau_s"])
+    if "resistance-temperature" in known and temperature_c is not None:
+        factor = np.expm1(known["resistance-temperature"]["b_k"] * (1.0 / (temperature_c + 273.15) - 1.0 / 298.15))
+        drop += battery.resistance_ohm * factor * x
+    return drop
 
 
 def read_battery(path: pathlib.Path, settings: dict) -> Battery:
