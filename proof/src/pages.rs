@@ -321,6 +321,90 @@ fn index(summary: &Summary, folder: &Path) -> String {
     text
 }
 
+/// The answer to "and, does it work?".
+fn in_short(text: &mut String, summary: &Summary) {
+    text.push_str("## In short\n\n");
+    let kind = |letter: &str| summary.by_kind.iter().find(|line| line.name == letter);
+    for (letter, what) in [
+        (
+            "a",
+            "Real recordings of which somebody else has measured what is right",
+        ),
+        ("b", "Simulators that others wrote"),
+        ("c", "Others' solver with our equations"),
+        ("d", "Our own generator, no headline"),
+    ] {
+        if let Some(line) = kind(letter) {
+            let _ = writeln!(
+                text,
+                "- {what} ({letter}): right {}; wrong {}, confidently {}.",
+                shown(&line.right),
+                short(&line.wrong),
+                short(&line.confidently_wrong)
+            );
+        }
+    }
+    for line in &summary.clean {
+        let _ = write!(
+            text,
+            "- Nothing concealed ({}): an effect named in {}",
+            line.kind,
+            shown(&line.named)
+        );
+        let data = if ["a", "b"].contains(&line.kind.as_str()) {
+            "(a) and (b)"
+        } else {
+            "(c) and (d)"
+        };
+        let theirs: Vec<String> = summary
+            .methods
+            .iter()
+            .filter(|method| method.data == data && method.name != "twin" && method.names_effects)
+            .filter(|method| method.false_alarms.of > 0)
+            .map(|method| {
+                format!(
+                    "{} {} of {}",
+                    method.name, method.false_alarms.count, method.false_alarms.of
+                )
+            })
+            .collect();
+        if theirs.is_empty() {
+            text.push_str(".\n");
+        } else {
+            let _ = writeln!(
+                text,
+                "; on a part of the clean data {data}: {}.",
+                theirs.join(", ")
+            );
+        }
+    }
+    if let Some(target) = summary
+        .targets
+        .iter()
+        .find(|target| target.what.starts_with("real recordings on which"))
+    {
+        let _ = writeln!(
+            text,
+            "- Real recordings on which twin's error on unseen data is below that of every one of today's methods: {}.",
+            target.found
+        );
+    }
+    let better = summary
+        .board
+        .iter()
+        .filter_map(|line| line.calibrated.as_ref())
+        .filter(|one| one.after_a < one.before_a)
+        .count();
+    if !summary.board.is_empty() {
+        let _ = writeln!(
+            text,
+            "- Emulated board: {better} of {} concealed sensor errors were corrected by writing the tool's calibration back (smaller error on another drive).",
+            summary.board.len()
+        );
+    }
+    text.push('\n');
+}
+
 fn real_table(text: &mut String, lines: &[RealLine]) {
     text.push_str("| recording | right is | by | said | | held out | lowest of today's methods |\n|---|---|---|---|---|---|---|\n");
     for line in lines {
