@@ -187,6 +187,7 @@ fn index(summary: &Summary, folder: &Path) -> String {
          - Shares carry Wilson's 95 % interval. *just visible* (strength 1): the effect moves the reading by 0.3 of the noise's rms.\n\n",
     );
 
+    in_short(&mut text, summary);
     text.push_str(
         "## Against what was wanted\n\n| figure | wanted | found | |\n|---|---|---|---|\n",
     );

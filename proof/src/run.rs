@@ -438,11 +438,15 @@ impl Campaign {
             let recording = Table::read(&folders.given.join("recording.csv"))?;
             record.overlap = score::overlap(place, &said.locations, &recording);
         }
+        let before = record
+            .said
+            .as_ref()
+            .and_then(|said| Some(said.held_out.get("i_meas_a")?.before));
         if planned.group == Group::Board
-            && let Some(board) = &self.board
+            && let (Some(board), Some(before_a)) = (&self.board, before)
         {
             let calibrated = record.timed("drive again", |_| {
-                board.calibrated(&self.root, planned, &folders)
+                board.calibrated(&self.root, &self.tool, planned, &folders, before_a)
             });
             match calibrated {
                 Ok(calibrated) => record.calibrated = calibrated,
