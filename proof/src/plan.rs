@@ -755,15 +755,27 @@ mod tests {
     #[test]
     fn every_effect_meets_every_strength_noise_and_drive() {
         let plan = plan(Extent::Full, &real());
-        for effect in SENSING.iter().chain(&BATTERY) {
-            let of_it = plan
-                .iter()
-                .filter(|one| one.group == Group::Single && one.case.effects[0].id == *effect)
-                .count();
-            assert!(
-                of_it >= STRENGTHS.len() * NOISES.len() * DRIVES.len(),
-                "{effect}"
-            );
+        let there = |effect: &str, strength: f64, noise: &str, drive: &str| {
+            plan.iter().any(|one| {
+                let case = &one.case;
+                one.group == Group::Single
+                    && case.effects[0].id == effect
+                    && case.strength() == strength
+                    && (case.noise.as_str(), case.drive.as_str()) == (noise, drive)
+            })
+        };
+        for strength in STRENGTHS {
+            for noise in NOISES {
+                for (effect, drive) in SENSING
+                    .into_iter()
+                    .flat_map(|effect| DRIVES.map(|drive| (effect, drive)))
+                {
+                    assert!(there(effect, strength, noise, drive), "{effect} {drive}");
+                }
+                for effect in BATTERY {
+                    assert!(there(effect, strength, noise, "us06"), "{effect}");
+                }
+            }
         }
     }
 
