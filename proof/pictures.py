@@ -118,7 +118,7 @@ def others(data: dict, folder: pathlib.Path) -> None:
 def false_alarms(data: dict, folder: pathlib.Path) -> None:
     """Clean recordings in which something is named."""
     lines = [(f"twin, {KINDS[line['kind']]}", line["named"], BLUE) for line in data["clean"]]
-    lines += [(line["name"], line["false_alarms"], GREY) for line in data["methods"]
+    lines += [(f"{line['name']}, {line['data']}", line["false_alarms"], GREY) for line in data["methods"]
               if line["name"] != "twin" and line["names_effects"] and line["false_alarms"]["of"]]
     lines = [line for line in lines if line[1]["of"]]
     if not lines:
@@ -138,25 +138,28 @@ def false_alarms(data: dict, folder: pathlib.Path) -> None:
 
 
 def methods(data: dict, folder: pathlib.Path) -> None:
-    """Right names against time."""
+    """Right names against time, on others' data and on our own."""
     lines = [line for line in data["methods"] if line["right"]["of"] and line["seconds"]]
-    if not lines:
+    sets = sorted({line["data"] for line in lines})
+    if not sets:
         return
-    figure, axes = plt.subplots(figsize=(6.4, 3.6))
-    for line in lines:
-        names = line["names_effects"] or line["name"] == "twin"
-        share = value(line["right"]) if names else 0.0
-        mark, colour = ("o", BLUE) if line["name"] == "twin" else METHOD_MARKS.get(line["name"], ("x", INK))
-        if names:
-            axes.errorbar(line["seconds"], share, yerr=np.array([reach(line["right"])]).T, color=colour, lw=1, capsize=3)
-        axes.plot(line["seconds"], share, mark, color=colour, ms=9)
-        axes.annotate(line["name"] + ("" if names else " (names none)"), (line["seconds"], share), xytext=(8, 5), textcoords="offset points")
-    axes.set_xscale("log")
-    axes.set_ylim(-5, 105)
-    axes.margins(x=0.25)
-    axes.set_xlabel("processor time of one recording, s (median)")
-    axes.set_ylabel("right name or class, %")
-    axes.set_title("Beside today's methods, on the same recordings")
+    figure, all_axes = plt.subplots(1, len(sets), figsize=(4.2 * len(sets), 3.6), sharey=True, squeeze=False)
+    for axes, data_set in zip(all_axes[0], sets):
+        for line in (line for line in lines if line["data"] == data_set):
+            names = line["names_effects"] or line["name"] == "twin"
+            share = value(line["right"]) if names else 0.0
+            mark, colour = ("o", BLUE) if line["name"] == "twin" else METHOD_MARKS.get(line["name"], ("x", INK))
+            if names:
+                axes.errorbar(line["seconds"], share, yerr=np.array([reach(line["right"])]).T, color=colour, lw=1, capsize=3)
+            axes.plot(line["seconds"], share, mark, color=colour, ms=9, ls="none", label=line["name"] + ("" if names else " (names none)"))
+        axes.set_xscale("log")
+        axes.set_ylim(-5, 105)
+        axes.margins(x=0.15)
+        axes.set_xlabel("processor time of one recording, s (median)")
+        axes.set_title(f"data {data_set}")
+    all_axes[0][0].set_ylabel("right name or class, %")
+    handles = {label: handle for axes in all_axes[0] for handle, label in zip(*axes.get_legend_handles_labels())}
+    figure.legend(handles.values(), handles.keys(), loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=4, frameon=False)
     save(figure, folder, "methods.svg")
 
 
@@ -199,7 +202,7 @@ def coverage(data: dict, folder: pathlib.Path) -> None:
     axes.axvspan(90, 98, color=GREEN, alpha=0.2, lw=0)
     axes.axvline(95, color=GREEN, lw=1)
     axes.set_xlim(0, 100)
-    axes.set_yticks(range(len(lines)), [f"{line['effect']} {line['name']}" for line in lines], fontsize=7)
+    axes.set_yticks(range(len(lines)), [f"{line['effect']} {line['name']} ({line['kind']})" for line in lines], fontsize=7)
     axes.invert_yaxis()
     axes.set_xlabel("% of the 95 % intervals that have the truth in them (band: 90 … 98 %)")
     axes.set_title("Are the intervals worth their name?")

@@ -120,9 +120,9 @@ pub struct Planned {
 pub struct TrueEffect {
     /// Of the library, or a name that it lacks.
     pub id: String,
-    /// By the library's names.
+    /// By the library's names; nothing where they do not follow from what was made.
     #[serde(default)]
-    pub parameters: BTreeMap<String, Option<f64>>,
+    pub parameters: Option<BTreeMap<String, Option<f64>>>,
 }
 
 /// What a publisher measured of a parameter.

@@ -151,6 +151,12 @@ fn counts_table(
     text.push('\n');
 }
 
+/// A line's name with the letters of who made its data.
+fn with_kinds(line: &Counts) -> String {
+    let letters: Vec<String> = line.kinds.iter().map(|kind| format!("({kind})")).collect();
+    format!("{} {}", line.name, letters.join(" "))
+}
+
 fn index(summary: &Summary, folder: &Path) -> String {
     let mut text = String::new();
     let quick = summary.plan != "full";
@@ -181,6 +187,7 @@ fn index(summary: &Summary, folder: &Path) -> String {
          - Shares carry Wilson's 95 % interval. *just visible* (strength 1): the effect moves the reading by 0.3 of the noise's rms.\n\n",
     );
 
+    in_short(&mut text, summary);
     text.push_str(
         "## Against what was wanted\n\n| figure | wanted | found | |\n|---|---|---|---|\n",
     );
@@ -221,7 +228,7 @@ fn index(summary: &Summary, folder: &Path) -> String {
             "others.svg",
             "What was hidden in the data of other people's simulators, and what was said",
         );
-        counts_table(&mut text, &others, "made by", |line| line.name.clone());
+        counts_table(&mut text, &others, "made by", with_kinds);
         confusion_table(&mut text, &summary.confusion, "b");
     }
 
@@ -265,10 +272,11 @@ fn index(summary: &Summary, folder: &Path) -> String {
         "detection.svg",
         "Share of right answers of each effect over its strength",
     );
-    if let Some((cases, median, most, within)) = &summary.over_oracle {
+    for (kind, (cases, median, most, within)) in &summary.over_oracle {
         let _ = writeln!(
             text,
-            "Held-out error over that of the true model, {cases} cases of (b) to (d): median {}, 90 % below {}; at most 1.1 in {}.\n",
+            "Held-out error over that of the true model, {cases} cases of {}: median {}, 90 % below {}; at most 1.1 in {}.\n",
+            kind_title(kind),
             number(*median),
             number(*most),
             shown(within)
@@ -280,18 +288,19 @@ fn index(summary: &Summary, folder: &Path) -> String {
         "coverage.svg",
         "Share of 95 % intervals that have the truth in them, by effect",
     );
-    if let Some((cases, low, middle, high)) = summary.overlap {
+    for (kind, (cases, low, middle, high)) in &summary.overlap {
         let _ = writeln!(
             text,
-            "Overlap of the named place with the true one (samples in both over samples in either), {cases} cases: median {}, quartiles {} and {}.\n",
-            number(middle),
-            number(low),
-            number(high)
+            "Overlap of the named place with the true one (samples in both over samples in either), {cases} cases of {}: median {}, quartiles {} and {}.\n",
+            kind_title(kind),
+            number(*middle),
+            number(*low),
+            number(*high)
         );
     }
     if summary.without.cases > 0 {
         text.push_str("### The true effect taken out of the library\n\nRight is *unknown*. A name is wrong, even one that fits as well.\n\n");
-        counts_table(&mut text, &[&summary.without], "", |line| line.name.clone());
+        counts_table(&mut text, &[&summary.without], "data", with_kinds);
     }
 
     text.push_str("## The emulated board (our emulator, the unmodified image)\n\n");
@@ -311,6 +320,90 @@ fn index(summary: &Summary, folder: &Path) -> String {
         summary.tool_sha256, summary.processors
     );
     text
+}
+
+/// The answer to "and, does it work?".
+fn in_short(text: &mut String, summary: &Summary) {
+    text.push_str("## In short\n\n");
+    let kind = |letter: &str| summary.by_kind.iter().find(|line| line.name == letter);
+    for (letter, what) in [
+        (
+            "a",
+            "Real recordings of which somebody else has measured what is right",
+        ),
+        ("b", "Simulators that others wrote"),
+        ("c", "Others' solver with our equations"),
+        ("d", "Our own generator, no headline"),
+    ] {
+        if let Some(line) = kind(letter) {
+            let _ = writeln!(
+                text,
+                "- {what} ({letter}): right {}; wrong {}, confidently {}.",
+                shown(&line.right),
+                short(&line.wrong),
+                short(&line.confidently_wrong)
+            );
+        }
+    }
+    for line in &summary.clean {
+        let _ = write!(
+            text,
+            "- Nothing concealed ({}): an effect named in {}",
+            line.kind,
+            shown(&line.named)
+        );
+        let data = if ["a", "b"].contains(&line.kind.as_str()) {
+            "(a) and (b)"
+        } else {
+            "(c) and (d)"
+        };
+        let theirs: Vec<String> = summary
+            .methods
+            .iter()
+            .filter(|method| method.data == data && method.name != "twin" && method.names_effects)
+            .filter(|method| method.false_alarms.of > 0)
+            .map(|method| {
+                format!(
+                    "{} {} of {}",
+                    method.name, method.false_alarms.count, method.false_alarms.of
+                )
+            })
+            .collect();
+        if theirs.is_empty() {
+            text.push_str(".\n");
+        } else {
+            let _ = writeln!(
+                text,
+                "; on a part of the clean data {data}: {}.",
+                theirs.join(", ")
+            );
+        }
+    }
+    if let Some(target) = summary
+        .targets
+        .iter()
+        .find(|target| target.what.starts_with("real recordings on which"))
+    {
+        let _ = writeln!(
+            text,
+            "- Real recordings on which twin's error on unseen data is below that of every one of today's methods: {}.",
+            target.found
+        );
+    }
+    let better = summary
+        .board
+        .iter()
+        .filter_map(|line| line.calibrated.as_ref())
+        .filter(|one| one.after_a < one.before_a)
+        .count();
+    if !summary.board.is_empty() {
+        let _ = writeln!(
+            text,
+            "- Emulated board: {better} of {} concealed sensor errors were corrected by writing the tool's calibration back (smaller error on another drive).",
+            summary.board.len()
+        );
+    }
+    text.push('\n');
 }
 
 fn real_table(text: &mut String, lines: &[RealLine]) {
@@ -388,7 +481,7 @@ fn real_table(text: &mut String, lines: &[RealLine]) {
 }
 
 fn methods_table(text: &mut String, summary: &Summary) {
-    text.push_str("| method | cases | right | wrong | false alarms | held out over the true model, median | processor time, median | failed |\n|---|---|---|---|---|---|---|---|\n");
+    text.push_str("| data | method | cases | right | wrong | false alarms | held out over the true model, median | processor time, median | failed |\n|---|---|---|---|---|---|---|---|---|\n");
     for line in &summary.methods {
         let right = if line.names_effects || line.name == "twin" {
             (
@@ -401,7 +494,8 @@ fn methods_table(text: &mut String, summary: &Summary) {
         };
         let _ = writeln!(
             text,
-            "| {} | {} | {} | {} | {} | {} | {} s | {} |",
+            "| {} | {} | {} | {} | {} | {} | {} | {} s | {} |",
+            line.data,
             line.name,
             line.cases,
             right.0,
@@ -583,7 +677,7 @@ fn tables(summary: &Summary) -> String {
         &mut text,
         &summary.by_group.iter().collect::<Vec<_>>(),
         "cases",
-        |line| line.name.clone(),
+        with_kinds,
     );
     for kind in ["b", "c", "d"] {
         if summary.confusion.iter().any(|line| line.kind == kind) {
@@ -592,10 +686,19 @@ fn tables(summary: &Summary) -> String {
         }
     }
     text.push_str("## Detection limit (single effects)\n\nThe smallest strength from which on at least 95 % are right.\n\n| effect | data | limit |");
-    for strength in crate::plan::STRENGTHS {
+    let mut strengths: Vec<f64> = summary
+        .detection
+        .iter()
+        .flat_map(|line| line.strengths.iter().map(|(strength, _)| *strength))
+        .collect();
+    strengths.sort_by(f64::total_cmp);
+    strengths.dedup();
+    for strength in &strengths {
         let _ = write!(text, " {strength} |");
     }
-    text.push_str("\n|---|---|---|---|---|---|---|---|\n");
+    text.push_str("\n|---|---|---|");
+    text.push_str(&"---|".repeat(strengths.len()));
+    text.push('\n');
     for line in &summary.detection {
         let _ = write!(
             text,
@@ -605,8 +708,8 @@ fn tables(summary: &Summary) -> String {
             line.limit
                 .map_or("none".to_owned(), |limit| limit.to_string())
         );
-        for strength in crate::plan::STRENGTHS {
-            let share = line.strengths.iter().find(|(one, _)| *one == strength);
+        for strength in &strengths {
+            let share = line.strengths.iter().find(|(one, _)| one == strength);
             let _ = write!(
                 text,
                 " {} |",
@@ -618,11 +721,12 @@ fn tables(summary: &Summary) -> String {
         }
         text.push('\n');
     }
-    text.push_str("\n## Parameters and their 95 % intervals\n\nOf cases that were named rightly. A gain's error is relative to its distance from 1.\n\n| effect | parameter | cases | median error | interval has the truth |\n|---|---|---|---|---|\n");
+    text.push_str("\n## Parameters and their 95 % intervals\n\nOf cases that were named rightly. A gain's error is relative to its distance from 1.\n\n| data | effect | parameter | cases | median error | interval has the truth |\n|---|---|---|---|---|---|\n");
     for line in &summary.parameters {
         let _ = writeln!(
             text,
-            "| {} | {} | {} | {} | {} |",
+            "| ({}) | {} | {} | {} | {} | {} |",
+            line.kind,
             line.effect,
             line.name,
             line.cases,

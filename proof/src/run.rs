@@ -411,8 +411,13 @@ impl Campaign {
         }
 
         let opened = safe.unseal(id, &record.truth_sha256)?;
-        let truth: Truth =
-            serde_json::from_str(&opened).with_context(|| format!("the truth of {id}"))?;
+        let truth: Truth = match serde_json::from_str(&opened) {
+            Ok(truth) => truth,
+            Err(error) => {
+                record.not_made = Some(format!("truth.json: {error}"));
+                return Ok(record);
+            }
+        };
         if planned.without {
             record.removed = truth
                 .effects
@@ -433,11 +438,15 @@ impl Campaign {
             let recording = Table::read(&folders.given.join("recording.csv"))?;
             record.overlap = score::overlap(place, &said.locations, &recording);
         }
+        let before = record
+            .said
+            .as_ref()
+            .and_then(|said| Some(said.held_out.get("i_meas_a")?.before));
         if planned.group == Group::Board
-            && let Some(board) = &self.board
+            && let (Some(board), Some(before_a)) = (&self.board, before)
         {
             let calibrated = record.timed("drive again", |_| {
-                board.calibrated(&self.root, planned, &folders)
+                board.calibrated(&self.root, &self.tool, planned, &folders, before_a)
             });
             match calibrated {
                 Ok(calibrated) => record.calibrated = calibrated,
@@ -492,5 +501,140 @@ fn locked<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     match mutex.lock() {
         Ok(guard) => guard,
         Err(poisoned) => poisoned.into_inner(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+    use crate::{case::Case, score::Outcome};
+
+    /// A maker that knows one clean recording.
+    const MAKER: &str = r#"
+import json, pathlib, sys
+for case, out in json.loads(pathlib.Path(sys.argv[2]).read_text()):
+    out = pathlib.Path(out)
+    out.mkdir()
+    for name in ("recording.csv", "holdout.csv"):
+        (out / name).write_text("t_s,i_ref_a,i_meas_a\n0,1,1\n1,2,2\n")
+    (out / "model.toml").write_text("schema = 1\n")
+    (out / "truth.json").write_text('{"kind": "d", "maker": "test"}')
+"#;
+
+    /// A tool that says "no mismatch", but fails if the seal is not on the disk or the truth is in reach.
+    const TOOL: &str = r#"#!/bin/sh
+for last; do :; done
+if [ "$1" = explain ]; then
+    grep -q '"sealed":"one"' ../../../seals.jsonl || exit 3
+    test -z "$(find .. -name 'truth*')" || exit 4
+    mkdir -p "$last"
+    printf '{"verdict": "no-mismatch", "effects": [], "locations": []}' > "$last/report.json"
+    cp model.toml "$last/model.toml"
+    echo run >> ../../../runs
+else
+    cp holdout.csv "$last"
+fi
+"#;
+
+    fn campaign(folder: &Path, tool: &str) -> Campaign {
+        let write = |name: &str, text: &str| {
+            let path = folder.join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(&path, text).unwrap();
+            path
+        };
+        write("proof/expected.toml", "case = []\n");
+        let maker = write("makers/make.py", MAKER);
+        let program = write("twin", tool);
+        fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
+        Campaign {
+            root: folder.to_path_buf(),
+            out: folder.join("out"),
+            tool: Tool {
+                program,
+                threads: 1,
+            },
+            makers: Makers {
+                python: PathBuf::from("python3"),
+                folder: maker.parent().unwrap().to_path_buf(),
+            },
+            methods: Methods {
+                python: PathBuf::from("python3"),
+                folder: folder.join("methods"),
+            },
+            board: None,
+            real: Vec::new(),
+            workers: 1,
+            keep: true,
+        }
+    }
+
+    fn plan() -> Vec<Planned> {
+        vec![Planned {
+            group: Group::Clean,
+            case: Case {
+                id: "one".to_owned(),
+                maker: "sensing".to_owned(),
+                effects: Vec::new(),
+                noise: "white".to_owned(),
+                drive: "us06".to_owned(),
+                seed: 1,
+                rows: 2,
+                options: serde_json::Map::new(),
+            },
+            without: false,
+            twice: true,
+            methods: Vec::new(),
+        }]
+    }
+
+    #[test]
+    fn a_case_is_sealed_before_the_tool_starts_and_run_once_only() {
+        let folder = tempfile::tempdir().unwrap();
+        let runs = || {
+            let text = fs::read_to_string(folder.path().join("out/runs")).unwrap();
+            text.lines().count()
+        };
+        let records = campaign(folder.path(), TOOL).run(&plan()).unwrap();
+        assert_eq!(records[0].error, None);
+        assert_eq!(records[0].judgement().unwrap().outcome, Outcome::Quiet);
+        assert_eq!(records[0].same, Some(true));
+        let (_, held_out) = records[0].said.as_ref().unwrap().main_held_out().unwrap();
+        assert_eq!((held_out.after, held_out.rows), (0.0, 2));
+        // Explained twice, for the comparison of the two reports.
+        assert_eq!(runs(), 2);
+        let again = campaign(folder.path(), TOOL).run(&plan()).unwrap();
+        assert_eq!((runs(), &again[0].key), (2, &records[0].key));
+        let other = campaign(folder.path(), &format!("{TOOL}# changed\n"))
+            .run(&plan())
+            .unwrap();
+        assert_eq!(runs(), 4);
+        assert_ne!(other[0].key, records[0].key);
+    }
+
+    #[test]
+    fn a_tool_that_fails_is_an_error_in_the_tables() {
+        let folder = tempfile::tempdir().unwrap();
+        let records = campaign(folder.path(), "#!/bin/sh\necho broken >&2\nexit 101\n")
+            .run(&plan())
+            .unwrap();
+        assert!(records[0].error.as_ref().unwrap().contains("broken"));
+        assert_eq!(records[0].judgement().unwrap().outcome, Outcome::Error);
+    }
+
+    #[test]
+    fn what_cannot_be_made_is_told_and_not_scored() {
+        let folder = tempfile::tempdir().unwrap();
+        let campaign = campaign(folder.path(), TOOL);
+        let maker = folder.path().join("makers/make.py");
+        fs::write(maker, "import sys\nsys.exit('no such strength')\n").unwrap();
+        let records = campaign.run(&plan()).unwrap();
+        let why = records[0].not_made.as_ref().unwrap();
+        assert!(why.contains("no such strength"), "{why}");
+        assert_eq!(records[0].judgement(), None);
     }
 }

@@ -150,7 +150,7 @@ pub fn estimates(truth: &Truth, said: &Said) -> Vec<Estimate> {
         let Some(named) = said.named.iter().find(|named| named.id == effect.id) else {
             continue;
         };
-        for (name, value) in &effect.parameters {
+        for (name, value) in effect.parameters.iter().flatten() {
             let reported = named.parameters.iter().find(|one| one.name == *name);
             let (Some(truth), Some(reported)) = (value, reported) else {
                 continue;
@@ -402,9 +402,7 @@ mod tests {
     #[test]
     fn intervals_are_compared_with_the_truth() {
         let mut truth = hidden(&[&["lag"]], &[]);
-        truth.effects[0]
-            .parameters
-            .insert("tau_s".to_owned(), Some(0.1));
+        truth.effects[0].parameters = Some([("tau_s".to_owned(), Some(0.1))].into());
         let mut report = said("explained", &[("lag", &[])]);
         report.named[0].parameters.push(Parameter {
             name: "tau_s".to_owned(),

@@ -8,7 +8,6 @@ use crate::{
     board::Calibrated,
     case::{Group, Truth},
     methods::Found,
-    plan::STRENGTHS,
     run::Record,
     score::{self, Judgement, Outcome, PLAIN},
     stats::{Share, median, quantile},
@@ -31,6 +30,8 @@ pub struct Counts {
     pub name: String,
     /// Who made the data.
     pub makers: Vec<String>,
+    /// The same by its letter.
+    pub kinds: Vec<String>,
     /// Cases with data.
     pub cases: usize,
     /// Of each outcome.
@@ -70,6 +71,8 @@ pub struct Detection {
 /// Errors of one parameter.
 #[derive(Debug, Clone, Serialize)]
 pub struct ParameterLine {
+    /// Kind of the data.
+    pub kind: String,
     /// Effect.
     pub effect: String,
     /// Its parameter.
@@ -137,6 +140,8 @@ pub struct PublishedLine {
 /// One of today's methods, beside the tool on the same cases.
 #[derive(Debug, Clone, Serialize)]
 pub struct MethodLine {
+    /// Who made the data: "(a) and (b)" or "(c) and (d)".
+    pub data: String,
     /// Its name; `twin` on the same cases.
     pub name: String,
     /// Cases it was run on and has something to say about.
@@ -229,10 +234,10 @@ pub struct Summary {
     pub parameters: Vec<ParameterLine>,
     /// All intervals together, by kind.
     pub coverage: BTreeMap<String, Share>,
-    /// Overlap of the place: count, quartiles.
-    pub overlap: Option<(usize, f64, f64, f64)>,
-    /// Held-out error over the oracle's: count, median, 90 %, share within 1.1.
-    pub over_oracle: Option<(usize, f64, f64, Share)>,
+    /// Overlap of the place by kind: count, quartiles.
+    pub overlap: BTreeMap<String, (usize, f64, f64, f64)>,
+    /// Held-out error over the oracle's by kind: count, median, 90 %, share within 1.1.
+    pub over_oracle: BTreeMap<String, (usize, f64, f64, Share)>,
     /// By kind.
     pub clean: Vec<Clean>,
     /// With the true effect taken out: outcomes.
@@ -309,8 +314,9 @@ impl Scored<'_> {
 fn counts<'a>(name: &str, cases: impl Iterator<Item = (&'a Scored<'a>, Judgement)>) -> Counts {
     let cases: Vec<_> = cases.collect();
     let mut outcomes = BTreeMap::new();
-    let mut makers = BTreeSet::new();
+    let (mut makers, mut kinds) = (BTreeSet::new(), BTreeSet::new());
     for (one, judged) in &cases {
+        kinds.insert(one.truth.kind.clone());
         *outcomes.entry(judged.outcome).or_insert(0) += 1;
         makers.insert(one.truth.maker.clone());
     }
@@ -322,6 +328,7 @@ fn counts<'a>(name: &str, cases: impl Iterator<Item = (&'a Scored<'a>, Judgement
     Counts {
         name: name.to_owned(),
         makers: makers.into_iter().collect(),
+        kinds: kinds.into_iter().collect(),
         cases: cases.len(),
         outcomes,
         right: Share::of(
@@ -468,13 +475,15 @@ fn detection(scored: &[Scored<'_>]) -> Vec<Detection> {
     effects
         .into_iter()
         .map(|((kind, effect), cases)| {
-            let strengths: Vec<(f64, Share)> = STRENGTHS
+            let mut used: Vec<f64> = cases.iter().map(|(strength, _)| *strength).collect();
+            used.sort_by(f64::total_cmp);
+            used.dedup();
+            let strengths: Vec<(f64, Share)> = used
                 .into_iter()
                 .map(|strength| {
                     let of_it = cases.iter().filter(|(s, _)| *s == strength);
                     (strength, Share::of(of_it, |(_, right)| *right))
                 })
-                .filter(|(_, share)| share.of > 0)
                 .collect();
             let mut limit = None;
             for (strength, share) in strengths.iter().rev() {
@@ -509,16 +518,20 @@ fn right_estimates<'a>(
 }
 
 fn parameters(scored: &[Scored<'_>]) -> Vec<ParameterLine> {
-    let mut lines: BTreeMap<(String, String), Vec<score::Estimate>> = BTreeMap::new();
-    for (_, estimate) in right_estimates(scored) {
+    let mut lines: BTreeMap<(String, String, String), Vec<score::Estimate>> = BTreeMap::new();
+    for (kind, estimate) in right_estimates(scored) {
         lines
-            .entry((estimate.effect.clone(), estimate.name.clone()))
+            .entry((
+                kind.to_owned(),
+                estimate.effect.clone(),
+                estimate.name.clone(),
+            ))
             .or_default()
             .push(estimate);
     }
     lines
         .into_iter()
-        .map(|((effect, name), estimates)| {
+        .map(|((kind, effect, name), estimates)| {
             // A gain's error counts against its distance from 1, what it would be without the effect.
             let off = if name == "gain" || name == "gain_ratio" {
                 1.0
@@ -531,6 +544,7 @@ fn parameters(scored: &[Scored<'_>]) -> Vec<ParameterLine> {
                 .map(|one| ((one.value - one.truth) / (one.truth - off)).abs())
                 .collect();
             ParameterLine {
+                kind,
                 effect,
                 name,
                 cases: estimates.len(),
@@ -556,18 +570,36 @@ fn coverage(scored: &[Scored<'_>]) -> BTreeMap<String, Share> {
         .collect()
 }
 
-fn overlap(scored: &[Scored<'_>]) -> Option<(usize, f64, f64, f64)> {
-    let values: Vec<f64> = scored
-        .iter()
-        .filter(|one| one.plain() && one.judged.outcome.right())
-        .filter_map(|one| one.record.overlap)
-        .collect();
-    Some((
-        values.len(),
-        quantile(&values, 0.25)?,
-        median(&values)?,
-        quantile(&values, 0.75)?,
-    ))
+/// Figures of some cases, by kind.
+fn by_kind(
+    scored: &[Scored<'_>],
+    figure: impl Fn(&Scored<'_>) -> Option<f64>,
+) -> BTreeMap<String, Vec<f64>> {
+    let mut kinds: BTreeMap<String, Vec<f64>> = BTreeMap::new();
+    for one in scored {
+        if let Some(value) = figure(one) {
+            kinds.entry(one.truth.kind.clone()).or_default().push(value);
+        }
+    }
+    kinds
+}
+
+fn overlap(scored: &[Scored<'_>]) -> BTreeMap<String, (usize, f64, f64, f64)> {
+    by_kind(scored, |one| {
+        let counts = one.plain() && one.judged.outcome.right();
+        one.record.overlap.filter(|_| counts)
+    })
+    .into_iter()
+    .filter_map(|(kind, values)| {
+        let quartiles = (
+            values.len(),
+            quantile(&values, 0.25)?,
+            median(&values)?,
+            quantile(&values, 0.75)?,
+        );
+        Some((kind, quartiles))
+    })
+    .collect()
 }
 
 /// Held-out error over that of the true model.
@@ -577,18 +609,21 @@ fn ratio(one: &Scored<'_>) -> Option<f64> {
     (oracle > 0.0).then(|| errors.after / oracle)
 }
 
-fn over_oracle(scored: &[Scored<'_>]) -> Option<(usize, f64, f64, Share)> {
-    let ratios: Vec<f64> = scored
-        .iter()
-        .filter(|one| one.hidden() && one.plain())
-        .filter_map(ratio)
-        .collect();
-    Some((
-        ratios.len(),
-        median(&ratios)?,
-        quantile(&ratios, 0.9)?,
-        Share::of(&ratios, |ratio| **ratio <= 1.1),
-    ))
+fn over_oracle(scored: &[Scored<'_>]) -> BTreeMap<String, (usize, f64, f64, Share)> {
+    by_kind(scored, |one| {
+        ratio(one).filter(|_| one.hidden() && one.plain())
+    })
+    .into_iter()
+    .filter_map(|(kind, ratios)| {
+        let figures = (
+            ratios.len(),
+            median(&ratios)?,
+            quantile(&ratios, 0.9)?,
+            Share::of(&ratios, |ratio| **ratio <= 1.1),
+        );
+        Some((kind, figures))
+    })
+    .collect()
 }
 
 fn clean(scored: &[Scored<'_>]) -> Vec<Clean> {
@@ -696,17 +731,24 @@ fn applies(found: &Found) -> bool {
 }
 
 fn methods(scored: &[Scored<'_>]) -> Vec<MethodLine> {
-    let names: BTreeSet<&String> = scored
+    let mut lines = methods_on(scored, "(a) and (b)", &["a", "b"]);
+    lines.extend(methods_on(scored, "(c) and (d)", &["c", "d"]));
+    lines
+}
+
+fn methods_on(scored: &[Scored<'_>], data: &str, kinds: &[&str]) -> Vec<MethodLine> {
+    let compared: Vec<&Scored<'_>> = scored
+        .iter()
+        .filter(|one| kinds.contains(&one.truth.kind.as_str()))
+        .filter(|one| one.record.methods.values().any(applies))
+        .collect();
+    let names: BTreeSet<&String> = compared
         .iter()
         .flat_map(|one| one.record.methods.keys())
         .collect();
     if names.is_empty() {
         return Vec::new();
     }
-    let compared: Vec<&Scored<'_>> = scored
-        .iter()
-        .filter(|one| one.record.methods.values().any(applies))
-        .collect();
     let twin: Vec<Compared<'_>> = compared
         .iter()
         .map(|one| {
@@ -720,7 +762,7 @@ fn methods(scored: &[Scored<'_>]) -> Vec<MethodLine> {
             }
         })
         .collect();
-    let mut lines = vec![method_line("twin", &twin, 0)];
+    let mut lines = vec![method_line(data, "twin", &twin, 0)];
     for name in names {
         let mut cases = Vec::new();
         let mut errors = 0;
@@ -745,7 +787,7 @@ fn methods(scored: &[Scored<'_>]) -> Vec<MethodLine> {
                 seconds: found.seconds,
             });
         }
-        lines.push(method_line(name, &cases, errors));
+        lines.push(method_line(data, name, &cases, errors));
     }
     lines
 }
@@ -759,7 +801,7 @@ struct Compared<'a> {
     seconds: Option<f64>,
 }
 
-fn method_line(name: &str, cases: &[Compared<'_>], errors: usize) -> MethodLine {
+fn method_line(data: &str, name: &str, cases: &[Compared<'_>], errors: usize) -> MethodLine {
     let hidden = || {
         cases
             .iter()
@@ -771,6 +813,7 @@ fn method_line(name: &str, cases: &[Compared<'_>], errors: usize) -> MethodLine 
         .collect();
     let seconds: Vec<f64> = cases.iter().filter_map(|case| case.seconds).collect();
     MethodLine {
+        data: data.to_owned(),
         name: name.to_owned(),
         cases: cases.len(),
         right: Share::of(hidden(), |case| case.judged.outcome.right()),
