@@ -1,6 +1,6 @@
 //! Only a part of each period is measured.
 
-use super::scene::{Cursor, Scale, Scene, integral};
+use super::scene::{Cursor, Scale, Scene, floored, integral};
 use crate::spectrum;
 
 use super::{Card, Clues, Effect, Parameter, Search, Stage};
@@ -82,7 +82,7 @@ impl Effect for SampledWindow {
             for row in rows.clone() {
                 let elapsed = drive.t_s[row] - start;
                 // The newest window that has ended.
-                let ended = ((elapsed - duty * period) / period).floor();
+                let ended = floored((elapsed - duty * period) / period);
                 if ended < 0.0 {
                     output[row] = scene.signal[rows.start];
                     continue;

@@ -458,6 +458,8 @@ fn pair(
             fits(bench, first, &next.entries, FIRSTS, 1)
         })
         .map(|(fit, _)| fit)
+        // More branches of one effect are no second effect.
+        .filter(|fit| fit.model.members.len() == now.model.members.len() + 2)
         .collect();
     let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
     let mut ranked: Vec<(Fit, f64)> = fits
