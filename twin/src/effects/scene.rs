@@ -212,12 +212,40 @@ impl Steps {
             return output;
         }
         let weights: Vec<[f64; 3]> = self.weights(tau_s, held).collect();
-        for rows in segments.iter().filter(|rows| !rows.is_empty()) {
-            let mut last = input[rows.start];
+        for (index, rows) in segments.iter().enumerate() {
+            let Some(mut last) = input[rows.clone()].first().copied() else {
+                continue;
+            };
             let after = rows.start + 1..rows.end;
-            let pairs = input[rows.clone()].windows(2);
-            for ((pair, out), kind) in pairs.zip(&mut output[after.clone()]).zip(&self.kind[after])
-            {
+            let input = &input[rows.clone()];
+            let output = &mut output[after.clone()];
+            let kinds = &self.kind[after];
+            // Each row waits for the one before it: of even steps four are made from one.
+            let fours = if self.even_s[index].is_some() {
+                output.len() / 4
+            } else {
+                0
+            };
+            let (even, output) = output.split_at_mut(4 * fours);
+            if let Some(kind) = kinds.first().filter(|_| fours > 0) {
+                let [kept, from, to] = weights[*kind as usize];
+                let powers = [kept, kept.powi(2), kept.powi(3), kept.powi(4)];
+                let inputs = input.windows(5).step_by(4);
+                for (out, x) in even.as_chunks_mut::<4>().0.iter_mut().zip(inputs) {
+                    let mut parts = [0.0; 4];
+                    let mut part = 0.0;
+                    for k in 0..4 {
+                        part = kept * part + (from * x[k] + to * x[k + 1]);
+                        parts[k] = part;
+                    }
+                    for k in 0..4 {
+                        out[k] = parts[k] + powers[k] * last;
+                    }
+                    last = out[3];
+                }
+            }
+            let left = input[4 * fours..].windows(2);
+            for ((pair, out), kind) in left.zip(output).zip(&kinds[4 * fours..]) {
                 let [kept, from, to] = weights[*kind as usize];
                 last = kept * last + (from * pair[0] + to * pair[1]);
                 *out = last;
@@ -409,6 +437,22 @@ fn moved(series: &[f64], steps: f64, out: &mut [f64]) {
     }
 }
 
+/// A series of even steps at another rate, and later by some steps.
+fn stretched(series: &[f64], rate: f64, steps: f64, out: &mut [f64]) {
+    let (Some(first), Some(last)) = (series.first(), series.last()) else {
+        return;
+    };
+    for (row, out) in out.iter_mut().enumerate() {
+        let at = row as f64 * rate - steps;
+        let whole = at as usize;
+        *out = match (series.get(whole), series.get(whole + 1)) {
+            (Some(here), Some(next)) if at > 0.0 => here + (next - here) * (at - whole as f64),
+            (Some(_), _) if at <= 0.0 => *first,
+            _ => *last,
+        };
+    }
+}
+
 /// [`f64::round`] of what is less than 2⁵² in size, without a call.
 pub fn rounded(value: f64) -> f64 {
     /// The largest number below a half.
@@ -488,9 +532,13 @@ impl<'a> Scene<'a> {
             let values = &mut sampled[these.clone()];
             if let Some(Some(step_s)) = self.steps.even_s.get(readings[0])
                 && (these.start, these.end) == even_rows
-                && skew == 1.0
             {
-                moved(&self.signal[these], delay_s / step_s, values);
+                let steps = delay_s / step_s;
+                if skew == 1.0 {
+                    moved(&self.signal[these], steps, values);
+                } else {
+                    stretched(&self.signal[these], 1.0 / skew, steps, values);
+                }
                 continue;
             }
             // What the sensor's clock calls t was at this time.
@@ -674,12 +722,18 @@ mod tests {
         for steps in [
             -60.0, -50.0, -49.5, -7.0, -1.3, -0.2, 0.0, 0.4, 1.0, 2.6, 48.9, 49.0, 50.0, 70.2,
         ] {
-            let mut out = vec![f64::NAN; 50];
-            moved(&series, steps, &mut out);
-            let mut cursor = Cursor::new(&t_s, 0..50);
-            for (out, t) in out.iter().zip(&t_s) {
-                let there = cursor.value(&series, t - 0.1 * steps, false);
-                assert!((out - there).abs() < 1e-9, "{steps} {t}");
+            for rate in [1.0, 0.8, 1.1] {
+                let mut out = vec![f64::NAN; 50];
+                if rate == 1.0 {
+                    moved(&series, steps, &mut out);
+                } else {
+                    stretched(&series, rate, steps, &mut out);
+                }
+                let mut cursor = Cursor::new(&t_s, 0..50);
+                for (out, t) in out.iter().zip(&t_s) {
+                    let there = cursor.value(&series, rate * t - 0.1 * steps, false);
+                    assert!((out - there).abs() < 1e-9, "{steps} {rate} {t}");
+                }
             }
         }
     }
