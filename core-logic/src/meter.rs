@@ -402,6 +402,26 @@ impl Coefficients {
     }
 }
 
+/// A configuration with the factors that follow from it. Working them out takes 128-bit divisions: to be done where nobody
+/// waits, so that [`MeterChannel::set_calibration`] only has to copy.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct MeterCalibration {
+    config: MeterConfig,
+    coefficients: Coefficients,
+}
+
+impl MeterCalibration {
+    /// Works the factors out.
+    #[must_use]
+    pub fn new(config: MeterConfig) -> Self {
+        Self {
+            config,
+            coefficients: Coefficients::new(&config),
+        }
+    }
+}
+
 /// Charge in units of 2⁻²⁴ pC from a current in µA over a time in µs.
 #[inline(never)]
 fn charge_of(current: Microamps, time: Duration) -> i128 {
@@ -481,9 +501,18 @@ impl MeterChannel {
     }
 
     /// Another calibration: counts after the last reading are taken by it. Charge and remainder stay as they are.
-    pub fn set_config(&mut self, config: MeterConfig) {
-        self.coefficients = Coefficients::new(&config);
+    pub fn set_calibration(&mut self, calibration: MeterCalibration) {
+        let MeterCalibration {
+            config,
+            coefficients,
+        } = calibration;
         self.config = config;
+        self.coefficients = coefficients;
+    }
+
+    /// As [`MeterChannel::set_calibration`], with the factors worked out here.
+    pub fn set_config(&mut self, config: MeterConfig) {
+        self.set_calibration(MeterCalibration::new(config));
     }
 
     /// The configuration in use.

@@ -3,6 +3,7 @@
 pub mod bench;
 pub mod board;
 pub mod bus_view;
+pub mod calibration;
 pub mod can_bus;
 pub mod can_frame;
 pub mod cpu;

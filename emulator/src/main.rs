@@ -13,6 +13,7 @@ use plant::front_end::Sensors;
 use recording::Mapping;
 use serde_json::json;
 
+use emulator::calibration::{self, Calibration};
 use emulator::drive::{self, Drive, Figures};
 use emulator::faults;
 use emulator::profile::{self, Profile, ProfileOptions};
@@ -51,6 +52,7 @@ Examples:
   cargo xtask emulate --profile recordings/panasonic-18650pf/25c-us06.csv --scale 19 --duration 600
   cargo xtask emulate --profile drive.csv --map i_ref_a=Shunt --map v_cell_v=Ucell --check
   cargo xtask emulate --profile drive.csv --sensor large.gain=1.02 --sensor both.tc_a_per_k=0.02
+  cargo xtask emulate --profile drive.csv --sensor large.gain=1.02 --calibration report/calibration.toml
   cargo xtask emulate --profile drive.csv --fault F9 --fault F21@7.5 --fault F14:open,large@10
   cargo xtask emulate --serve                    a parked car for python-can and a Modbus client
   cargo xtask emulate --serve --profile drive.csv --scale 19
@@ -98,6 +100,9 @@ struct DriveArguments {
     /// given repeatedly
     #[arg(long, value_name = "SENSOR.PARAMETER=VALUE")]
     sensor: Vec<String>,
+    /// Registers to write before the drive, as `twin explain` leaves them: over RS485, on the parked vehicle, saved
+    #[arg(long, value_name = "TOML")]
+    calibration: Option<PathBuf>,
     /// Lists the faults with their parameters, and ends
     #[arg(long)]
     list_faults: bool,
@@ -235,10 +240,24 @@ fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
         .as_ref()
         .and_then(|profile| profile.rows.last())
         .map_or(0.0, |row| row.t_s);
-    let setup = setup(arguments, profile)?;
+    let calibration = arguments
+        .calibration
+        .as_deref()
+        .map(|path| Calibration::read(path).map_err(|error| Failure::Input(format!("{error:#}"))))
+        .transpose()?;
+    let mut setup = setup(arguments, profile)?;
     let stop = serve::stop_flag()
         .map_err(|error| Failure::Input(format!("listening for Ctrl-C: {error}")))?;
 
+    let calibration = calibration
+        .map(|calibration| {
+            // The same board, before the drive.
+            let parked = self::setup(arguments, None)?;
+            let (flash, account) = calibration::commission(&firmware, parked, &calibration)?;
+            setup.flash = Some(flash);
+            Ok::<_, Failure>(account)
+        })
+        .transpose()?;
     let mut drive = Drive::new(&firmware, setup, arguments.out.as_deref())?;
     for injection in &injections {
         faults::apply(injection, &mut drive.rig);
@@ -254,7 +273,10 @@ fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
         run(&mut drive, end_s, &stop)?;
     }
 
-    let figures = drive.figures();
+    let figures = Figures {
+        calibration,
+        ..drive.figures()
+    };
     let text = drive::summary(&figures);
     let json = report(arguments, &figures).map_err(|error| Failure::Image(error.to_string()))?;
     drive.finish(&text, &json)?;
@@ -340,6 +362,7 @@ fn report(arguments: &DriveArguments, figures: &Figures) -> serde_json::Result<S
             "seed": arguments.seed,
             "faults": arguments.fault,
             "sensor": arguments.sensor,
+            "calibration": arguments.calibration,
             "served": arguments.serve,
         },
         "figures": figures,

@@ -12,7 +12,9 @@ use twin::effects::find_with;
 use twin::explain::workbench::{Member, Model, Workbench};
 use twin::explain::{Options, explain};
 use twin::model::FrontEndKind;
-use twin::problem::{Accuracy, Base, BatteryBase, Drive, Observed, Problem, SensorBase, View};
+use twin::problem::{
+    Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, View,
+};
 use twin::simulate::board::{Board, Pace};
 
 fn main() {
@@ -117,6 +119,7 @@ fn problem(rows: usize, view: View, effects: &[(&str, &[f64])]) -> Problem {
         drive,
         modelled: Vec::new(),
         noise: if battery { 0.001 } else { NOISE_A },
+        coloured: Coloured::default(),
         accuracy: Accuracy::default(),
     };
     let effects: Vec<(String, Vec<f64>)> = effects

@@ -16,7 +16,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use crate::effects::chain::{Chain, Nuisance};
-use crate::effects::{Effect, Search, find, find_with};
+use crate::effects::{Effect, Search, Stage, find, find_with};
 use crate::problem::Problem;
 use crate::report::data::{
     EffectReport, FittedModel, HoldoutReport, Inputs, Location, ParameterReport, Report,
@@ -34,6 +34,9 @@ const LEFT: f64 = 0.04;
 const STRUCTURE: f64 = 0.1;
 /// What remains is too loud from this multiple of the stated noise on.
 const LOUD: f64 = 1.3;
+/// Where no effect passes, loudness is judged by this share of the residual's sizes, which is so many standard deviations of a
+/// normal distribution: single readings at wrong moments are no unknown physics.
+const COMMON: (f64, f64) = (0.8, 1.2816);
 /// From this correlation on, what is left sits where the named effects act: their shape is wrong.
 const ALIKE: f64 = 0.35;
 /// From this ratio of what is left explainable to what the named effects explain on, their names are not to be trusted: another
@@ -181,7 +184,15 @@ fn one(
     vague(&bench, &mut selection, options.seed);
     let left = features.explain(&selection.fit.residual, options.seed);
     let confirmed = confirmed(&selection, problem, holdouts);
-    let verdict = judge(&bench, &mut selection, &features, confirmed, before, left);
+    let verdict = judge(
+        &bench,
+        &mut selection,
+        &features,
+        confirmed,
+        before,
+        left,
+        options.seed,
+    );
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);
@@ -318,15 +329,19 @@ fn vague(bench: &Workbench<'_>, selection: &mut Selection, seed: u64) {
             .iter()
             .zip(&intervals)
             .position(|(member, intervals)| {
-                let parameters = member.effect.card().parameters;
-                parameters
+                // Where one value is told (a knee), another (how soft it is) need not be.
+                let mut scales = member
+                    .effect
+                    .card()
+                    .parameters
                     .iter()
                     .zip(intervals)
-                    .any(|(parameter, [low, high])| {
-                        parameter.search == Search::Logarithmic
-                            && !parameter.internal
-                            && *high > VAGUE * low
+                    .filter(|(parameter, _)| {
+                        parameter.search == Search::Logarithmic && !parameter.internal
                     })
+                    .map(|(_, [low, high])| *high > VAGUE * low)
+                    .peekable();
+                scales.peek().is_some() && scales.all(|vague| vague)
             });
         let Some(index) = found else {
             return;
@@ -352,6 +367,42 @@ fn elsewhere(model: &Model) -> Model {
     }
 }
 
+/// The size that a share of a series stays below.
+fn quantile(series: &[f64], share: f64) -> f64 {
+    let mut sizes: Vec<f64> = series.iter().map(|value| value.abs()).collect();
+    sizes.sort_unstable_by(f64::total_cmp);
+    let at = (sizes.len() as f64 * share) as usize;
+    sizes.get(at).copied().unwrap_or_default()
+}
+
+/// Energy that a true model would leave: the stated noise, as it comes through the end of the chain.
+fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
+    let count = bench.len() as f64;
+    let noise = bench.problem.noise;
+    let ends = fit
+        .model
+        .members
+        .iter()
+        .any(|member| member.effect.card().stage == Stage::Output);
+    if noise > 0.0 && ends {
+        let energy = bench.noise_energy(&fit.model, &fit.predicted, noise, seed);
+        energy.max(noise * noise * count)
+    } else if noise > 0.0 {
+        noise * noise * count
+    } else {
+        // A grid is told by the readings; reading and simulation are both on it.
+        let clues = bench.clues(&fit.predicted);
+        let grid: f64 = fit
+            .model
+            .members
+            .iter()
+            .filter_map(|member| member.effect.mark(&bench.scale, &clues))
+            .map(|mark| mark.variance)
+            .sum();
+        2.0 * grid * count
+    }
+}
+
 /// The verdict on one signal. Where the names are not to be trusted, the effects are taken back.
 fn judge(
     bench: &Workbench<'_>,
@@ -360,10 +411,20 @@ fn judge(
     confirmed: bool,
     before: Explainable,
     left: Explainable,
+    seed: u64,
 ) -> Verdict {
-    let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
+    let count = bench.len().max(1) as f64;
+    let noise = bench.problem.noise;
+    let known = noise.max(bench.problem.accuracy.zero);
     if selection.named.is_empty() {
-        return if before.is_real() && before.share > STRUCTURE {
+        let common = quantile(&selection.plain.residual, COMMON.0) / COMMON.1;
+        return if noise > 0.0 && common > LOUD * known {
+            selection.decisions.push(format!(
+                "No effect passes, yet all over the recording the mismatch is {} times the noise that the model file states: unknown.",
+                short(common / noise)
+            ));
+            Verdict::Unknown
+        } else if before.is_real() && before.share > STRUCTURE {
             selection.decisions.push(format!(
                 "No effect passes, yet a smooth function of the recorded inputs takes {} of the held-out error (placebos up to {}): unknown.",
                 percent(before.share),
@@ -377,19 +438,20 @@ fn judge(
             Verdict::NoMismatch
         };
     }
-    let count = bench.len().max(1) as f64;
-    let explained = energy(&selection.plain) - energy(&selection.fit);
+    let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
     let rest = energy(&selection.fit);
+    let unavoidable = unavoidable(bench, &selection.fit, seed);
+    let quiet = noise * noise * count;
+    let explained = energy(&selection.plain) - rest + (unavoidable - quiet);
     let smooth = if left.is_real() && left.share > LEFT {
         left.share * rest
     } else {
         0.0
     };
     // What is beyond the noise that the design states is structure too, whatever the inputs say of it.
-    let noise = bench.problem.noise;
-    let known = noise.max(bench.problem.accuracy.zero);
-    let beyond = if noise > 0.0 && rest > (LOUD * known).powi(2) * count {
-        rest - known * known * count
+    let allowed = unavoidable.max(known * known * count);
+    let beyond = if noise > 0.0 && rest > LOUD * LOUD * allowed {
+        rest - allowed
     } else {
         0.0
     };
@@ -404,7 +466,7 @@ fn judge(
     if beyond > 0.0 {
         selection.decisions.push(format!(
             "What remains is {} times the noise that the model file states.",
-            short((rest / count).sqrt() / noise)
+            short((rest / unavoidable).sqrt())
         ));
     }
     if smooth > 0.0 || beyond > 0.0 {

@@ -131,14 +131,16 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             .map(|path| path.display().to_string()),
         out: Some(out.display().to_string()),
     };
+    let calibration = calibration::calibrate(&model, &report);
+    report.remarks.extend(calibration.remarks);
     let extended = extended(&model, &report, &arguments.model, out)?;
     let mut files = vec![
         ("report.json", json::render(&report)),
         ("report.html", html::render(&report)),
         ("model.toml", extended),
     ];
-    if let Some(calibration) = calibration::render(&model, &report) {
-        files.push(("calibration.toml", calibration));
+    if let Some(text) = calibration.text {
+        files.push(("calibration.toml", text));
     }
     write(out, &files)?;
     let width = std::env::var("COLUMNS")

@@ -22,7 +22,7 @@ use crate::{
     align, explain,
     failure::Failure,
     model::{Model, Sensor, registry},
-    problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View},
+    problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View},
     simulate::board::{Board, Pace},
 };
 
@@ -64,6 +64,9 @@ pub struct Item {
     /// Rows at which a board's new conversion shows for the first time; empty: all.
     pub fresh: Vec<bool>,
 }
+
+/// Ages that are tried to either side where the rows do not tell the age of a reading.
+const PHASES: i32 = 10;
 
 /// Everything that explaining and simulating need.
 #[derive(Clone, Debug)]
@@ -297,7 +300,7 @@ impl Work<'_> {
                 Pace::Seen => board.slack_s(&observed),
                 _ => 0.0,
             };
-            let reported = phase::closest(sensor.age_s, slack_s, &observed, run);
+            let (_, reported) = phase::closest(sensor.age_s, (slack_s, PHASES), &observed, run);
             self.compare_range_flag(board, &mut drive, &observed, &reported.range_high);
             base.reading = reported.current_a;
             fresh = reported.fresh;
@@ -325,6 +328,10 @@ impl Work<'_> {
             modelled: Vec::new(),
             noise: (sensor.noise.powi(2) + sensor.noise_coloured.powi(2) + step * step / 12.0)
                 .sqrt(),
+            coloured: Coloured {
+                rms: sensor.noise_coloured,
+                tau_s: sensor.noise_coloured_tau_s,
+            },
             accuracy: Accuracy {
                 zero: sensor.accuracy.zero,
                 gain: sensor.accuracy.gain,

@@ -82,18 +82,15 @@ pub fn lines(t_s: &[f64], values: &[f64], step_s: f64) -> Vec<Line> {
             power.get(left).unwrap_or_default(),
             power.get(right).unwrap_or_default(),
         ];
-        let count = others[0].len() + others[1].len();
-        if count < 20 {
-            continue;
-        }
         // The median of an exponential distribution is ln 2 times its mean. It is below a limit if more than half of the values
-        // are: no need to sort them.
-        let below = |limit: f64| {
-            let part = |values: &[f64]| values.iter().filter(|value| **value < limit).count();
-            part(others[0]) + part(others[1])
-        };
+        // are: no need to sort them. Either side is asked for itself: coloured noise falls from one to the other.
         let limit = here * std::f64::consts::LN_2 / threshold;
-        if below(limit) > count / 2 && below(f64::MIN_POSITIVE) <= count / 2 {
+        let stands_out = |values: &[f64]| {
+            let below = |limit: f64| values.iter().filter(|value| **value < limit).count();
+            below(limit) > values.len() / 2 && below(f64::MIN_POSITIVE) <= values.len() / 2
+        };
+        let sides = others.iter().filter(|values| values.len() >= 10);
+        if sides.clone().count() > 0 && sides.into_iter().all(|values| stands_out(values)) {
             found.push((at, here));
         }
     }

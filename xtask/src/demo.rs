@@ -1,7 +1,8 @@
-//! `cargo xtask demo`: an effect that the firmware does not know is found in the emulated board's own log, and one in a
-//! real recording.
+//! `cargo xtask demo`: an effect that the firmware does not know is found in the emulated board's own log and corrected on
+//! the board, and one is found in a real recording.
 
 use std::{
+    path::Path,
     process::Command,
     time::{Duration, Instant},
 };
@@ -63,29 +64,33 @@ pub fn run(workspace: &Workspace) -> Result<()> {
                 "90 s of {DRIVE} × {SCALE}. Concealed from the firmware and from twin: {CONCEALED},\n\
                  that is, the large Hall sensor is 2 % too sensitive."
             );
-            let mut drive = again(&emulate);
-            drive
-                .args(["drive", "--profile", DRIVE, "--scale", SCALE])
-                .args(PIECE)
-                .args(["--sensor", CONCEALED, "--image"])
-                .arg(&elf)
-                .arg("--out")
-                .arg(&out);
-            process::run(&mut drive)
+            process::run(drive_of(&emulate, &elf).arg("--out").arg(&out))
         },
     )?;
 
     let board = out.join("board");
     timed("What twin makes of the board's log", &mut || {
-        let mut explain = again(&twin);
-        explain
-            .args(["explain", "--model", "models/board-dual-range.toml"])
-            .arg("--recording")
-            .arg(out.join("board.csv"))
-            .arg("--out")
-            .arg(&board);
-        process::run(&mut explain)
+        process::run(&mut explain_of(&twin, &out, &board))
     })?;
+
+    let corrected = out.join("corrected");
+    timed(
+        "The same drive, the board corrected by what twin found",
+        &mut || {
+            println!(
+                "Written over RS485 on the parked vehicle: {}",
+                board.join("calibration.toml").display()
+            );
+            process::run(
+                drive_of(&emulate, &elf)
+                    .arg("--calibration")
+                    .arg(board.join("calibration.toml"))
+                    .arg("--out")
+                    .arg(&corrected),
+            )?;
+            process::run(&mut explain_of(&twin, &corrected, &corrected.join("board")))
+        },
+    )?;
 
     let card = out.join("gpu");
     timed("What twin makes of a real recording", &mut || {
@@ -104,7 +109,7 @@ pub fn run(workspace: &Workspace) -> Result<()> {
     })?;
 
     println!("\n== Reports, to open in a browser");
-    for folder in [&board, &card] {
+    for folder in [&board, &corrected.join("board"), &card] {
         println!("{}", folder.join("report.html").display());
     }
     println!("\n== Time");
@@ -114,6 +119,29 @@ pub fn run(workspace: &Workspace) -> Result<()> {
     }
     println!("{:8.1} s  in all", in_all.as_secs_f64());
     Ok(())
+}
+
+/// The drive on the board with its concealed error.
+fn drive_of(emulate: &Command, elf: &Path) -> Command {
+    let mut drive = again(emulate);
+    drive
+        .args(["drive", "--profile", DRIVE, "--scale", SCALE])
+        .args(PIECE)
+        .args(["--sensor", CONCEALED, "--image"])
+        .arg(elf);
+    drive
+}
+
+/// What `twin` makes of the log in a folder.
+fn explain_of(twin: &Command, log: &Path, out: &Path) -> Command {
+    let mut explain = again(twin);
+    explain
+        .args(["explain", "--model", "models/board-dual-range.toml"])
+        .arg("--recording")
+        .arg(log.join("board.csv"))
+        .arg("--out")
+        .arg(out);
+    explain
 }
 
 /// The same program anew, from the workspace's own folder.

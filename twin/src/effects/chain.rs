@@ -92,10 +92,28 @@ impl<'a> Chain<'a> {
 
     /// What the simulation says at each observed row; NaN where the drive does not reach.
     pub fn run(&self, members: &Members<'_>, nuisance: Nuisance) -> Vec<f64> {
+        self.run_with_noise(members, nuisance, &[])
+    }
+
+    /// The same with noise of the sensor, one value for each observed row, ahead of what ends the chain (steps, thresholds,
+    /// rails).
+    pub fn run_with_noise(
+        &self,
+        members: &Members<'_>,
+        nuisance: Nuisance,
+        noise: &[f64],
+    ) -> Vec<f64> {
         let links = self.links(members);
         let mut scene = self.start.clone();
         for link in links {
             self.apply(&mut scene, link, nuisance);
+            if matches!(link, Link::Beside) {
+                scene
+                    .signal
+                    .iter_mut()
+                    .zip(noise)
+                    .for_each(|(value, noise)| *value += noise);
+            }
         }
         scene.signal
     }

@@ -104,8 +104,6 @@ pub struct Battery<'a> {
     pub capacity_ah: f64,
     /// Share of the charge put in that comes back.
     pub efficiency: f64,
-    /// A consumer that the current sensor does not see, in A.
-    pub load_a: f64,
     /// Added to the initial state of charge, 0 … 1.
     pub soc_shift: f64,
     /// Factor of the ohmic resistance by design.
@@ -586,7 +584,6 @@ impl<'a> Battery<'a> {
             } else {
                 1.0
             },
-            load_a: 0.0,
             soc_shift: 0.0,
             resistance: 1.0,
             soc: Series::default(),
@@ -603,7 +600,6 @@ impl<'a> Battery<'a> {
         let mut soc = vec![0.0; drive.len()];
         let per_as = 1.0 / (3600.0 * self.capacity_ah);
         let flow = |current: f64| {
-            let current = current + self.load_a;
             if current < 0.0 {
                 current * self.efficiency
             } else {
@@ -644,8 +640,7 @@ impl<'a> Battery<'a> {
     pub fn warm(&mut self) {
         if let Some(b_k) = self.arrhenius_k {
             for (factor, t) in self.factor.iter_mut().zip(&self.temperature_c) {
-                let inverse = 1.0 / (t + ZERO_CELSIUS_K) - 1.0 / (REFERENCE_C + ZERO_CELSIUS_K);
-                *factor *= (b_k * inverse).exp();
+                *factor *= arrhenius(b_k, *t);
             }
         }
     }
@@ -662,6 +657,12 @@ impl<'a> Battery<'a> {
             *value = open_v - ohms * factor * *value + added_v;
         }
     }
+}
+
+/// Factor of a resistance of Arrhenius temperature `b_k`, in K, from 25 °C to a temperature.
+pub fn arrhenius(b_k: f64, temperature_c: f64) -> f64 {
+    let inverse = 1.0 / (temperature_c + ZERO_CELSIUS_K) - 1.0 / (REFERENCE_C + ZERO_CELSIUS_K);
+    (b_k * inverse).exp()
 }
 
 /// Straight lines between the points of the table and beyond its ends.

@@ -7,7 +7,7 @@ use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 use rayon::prelude::*;
 
 use super::fit::{TUNING, dot, normal, solve, spread};
-use super::screen::{Folds, Turn, turned_products};
+use super::screen::{Folds, ITSELF, Turn, turned_products};
 use super::workbench::Workbench;
 use crate::effects::scene::{Cursor, Steps};
 
@@ -114,15 +114,39 @@ impl Features {
                 )
             }))
             .collect();
+        // Where the drive or the residual is like itself when it is moved (a loop that repeats), blocks get random signs instead.
+        let drive = self.columns.get(1).map_or(&residual[..], Vec::as_slice);
+        let repeats: Vec<bool> = turns
+            .iter()
+            .map(|turn| repeats(&residual, *turn) || repeats(drive, *turn))
+            .collect();
+        let signs: Vec<Vec<f64>> = turns
+            .iter()
+            .map(|_| {
+                let sign = |even: bool| if even { 1.0 } else { -1.0 };
+                (0..self.blocks.len())
+                    .map(|_| sign(random.next_u32().is_multiple_of(2)))
+                    .collect()
+            })
+            .collect();
         let columns: Vec<&[f64]> = self.columns.iter().map(Vec::as_slice).collect();
         let products = turned_products(&columns, &residual, &turns, &self.blocks);
         let all = dot(&residual, &residual).max(1e-300);
         let shares: Vec<f64> = (0..turns.len())
             .into_par_iter()
             .map(|draw| {
+                let flipped = draw > 0 && repeats[draw];
                 let rights: Vec<f64> = products
                     .iter()
-                    .flat_map(|products| products.row(draw).iter().copied().collect::<Vec<f64>>())
+                    .zip(&signs[draw])
+                    .flat_map(|(products, sign)| {
+                        let (row, sign) = if flipped { (0, *sign) } else { (draw, 1.0) };
+                        products
+                            .row(row)
+                            .iter()
+                            .map(|product| sign * product)
+                            .collect::<Vec<f64>>()
+                    })
                     .collect();
                 self.folds.gain(&rights) / all
             })
@@ -134,6 +158,22 @@ impl Features {
                 .fold(0.0, |most, share| f64::max(most, *share)),
         }
     }
+}
+
+/// Whether a series, less its mean, is like itself when it is turned.
+fn repeats(series: &[f64], (by, reversed): Turn) -> bool {
+    let count = series.len();
+    let mean = series.iter().sum::<f64>() / count.max(1) as f64;
+    let at = |row: usize| {
+        let row = (row + by) % count;
+        series[if reversed { count - 1 - row } else { row }] - mean
+    };
+    let (mut together, mut alone) = (0.0, 0.0);
+    for (row, value) in series.iter().enumerate() {
+        together += (value - mean) * at(row);
+        alone += (value - mean).powi(2);
+    }
+    together.abs() > ITSELF * alone
 }
 
 impl Features {

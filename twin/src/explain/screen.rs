@@ -21,7 +21,7 @@ pub const DRAWS: usize = 200;
 /// Rows that signatures are compared over; longer recordings are thinned out.
 const MOST_ROWS: usize = 30_000;
 /// A residual moved to where a candidate looks like itself again is no placebo for it: signs are drawn then.
-const ITSELF: f64 = 0.6;
+pub const ITSELF: f64 = 0.6;
 
 /// A candidate with the values from which its signature was taken.
 #[derive(Clone, Debug)]

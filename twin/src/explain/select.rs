@@ -22,6 +22,9 @@ const STARTS: usize = 2;
 const FLOOR: f64 = 0.04;
 /// A smaller one takes away at least this share where it acts.
 const PLACE: f64 = 0.12;
+/// Standard deviations of the stated noise that an effect has to be away from nothing: one in a thousand recordings has an effect
+/// of some thirty by chance that is 4.2 away.
+const CERTAIN: f64 = 4.2;
 /// Rows where an effect changes the reading by at least this share of its largest change are where it acts.
 const ACTS: f64 = 0.2;
 /// Share of the held-out error from which on a single effect is clear by itself.
@@ -211,7 +214,7 @@ fn marked(
             card.id,
             percent(gain)
         ));
-        let smooth = fit(bench, &base, None);
+        let smooth = missed(bench, fit(bench, &base, None));
         let model = smooth.model.with(Member {
             effect,
             values: mark.values,
@@ -238,6 +241,21 @@ fn marked(
         now = Fit::of(bench, model, smooth.cost);
     }
     (now, named)
+}
+
+/// Leaves out what is too small beside the others: steps make single readings jump by what hardly moves them.
+fn missed(bench: &Workbench<'_>, mut now: Fit) -> Fit {
+    let mut index = 0;
+    while index < now.model.members.len() {
+        let without = fit(bench, &now.model.without(index), None);
+        let gain = share(bench, &without, &now);
+        if obstacle(bench, &without, &now, index, gain).is_some() {
+            now = without;
+        } else {
+            index += 1;
+        }
+    }
+    now
 }
 
 /// Fits the most promising entries in place of nothing.
@@ -384,6 +402,12 @@ fn obstacle(
             percent(FLOOR)
         ));
     }
+    let deviations = bench.deviations(&change);
+    if deviations < CERTAIN {
+        return Some(format!(
+            "{deviations:.1} standard deviations of what the stated coloured noise does by itself"
+        ));
+    }
     let noise = to / rows;
     if card.stage == Stage::Output
         && card
@@ -458,7 +482,7 @@ fn pair(
             fits(bench, first, &next.entries, FIRSTS, 1)
         })
         .map(|(fit, _)| fit)
-        // More branches of one effect are no second effect.
+        // One more branch of the first is no second effect.
         .filter(|fit| fit.model.members.len() == now.model.members.len() + 2)
         .collect();
     let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
@@ -627,9 +651,22 @@ fn swapped(bench: &Workbench<'_>, now: &Fit) -> Vec<(usize, Fit)> {
             let id = now.model.members[index].id();
             let without = fit(bench, &now.model.without(index), None);
             let rivals = rivals(bench, &without, &now.model, id);
-            rivals
+            // An alignment that is free can take over what a rival explains, and leave it nothing to be named for.
+            let models: Vec<Model> = rivals
+                .into_iter()
+                .map(|rival| without.model.with(rival))
+                .flat_map(|model| {
+                    let unaligned = bench.aligns(&model).then(|| Model {
+                        unaligned: true,
+                        ..model.clone()
+                    });
+                    [Some(model), unaligned]
+                })
+                .flatten()
+                .collect();
+            models
                 .into_par_iter()
-                .map(|rival| (index, fit(bench, &without.model.with(rival), None)))
+                .map(|model| (index, fit(bench, &model, None)))
                 .collect::<Vec<_>>()
         })
         .collect()

@@ -4,6 +4,10 @@ use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Mutex;
 
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng as _;
+use rand_distr::{Distribution as _, StandardNormal};
+
 use crate::effects::chain::{Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
 use crate::effects::{Clues, Effect, LIBRARY, Stage};
@@ -47,6 +51,8 @@ pub struct Model {
     pub members: Vec<Member>,
     /// The base.
     pub nuisance: Nuisance,
+    /// Samples stand at their rows, though an effect works between them.
+    pub unaligned: bool,
 }
 
 impl Model {
@@ -102,7 +108,7 @@ pub struct Workbench<'a> {
 }
 
 /// A model to the last digit.
-type Key = (Vec<(&'static str, Vec<u64>)>, [u64; 3]);
+type Key = (Vec<(&'static str, Vec<u64>)>, [u64; 3], bool);
 
 fn key(model: &Model) -> Key {
     let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect();
@@ -119,6 +125,7 @@ fn key(model: &Model) -> Key {
             nuisance.alignment_s,
         ]
         .map(f64::to_bits),
+        model.unaligned,
     )
 }
 
@@ -196,6 +203,47 @@ impl<'a> Workbench<'a> {
         self.chain.run(&members(model), model.nuisance)
     }
 
+    /// Squared change, summed over the rows that count, that noise of a standard deviation ahead of the end of the chain makes to
+    /// the simulation: a reading near a threshold jumps by noise, and a stepped one has the steps twice.
+    pub fn noise_energy(&self, model: &Model, predicted: &[f64], deviation: f64, seed: u64) -> f64 {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let noise: Vec<f64> = StandardNormal
+            .sample_iter(&mut random)
+            .take(self.problem.observed.t_s.len())
+            .map(|value: f64| deviation * value)
+            .collect();
+        let noisy = self
+            .chain
+            .run_with_noise(&members(model), model.nuisance, &noise);
+        self.rows
+            .iter()
+            .zip(predicted)
+            .map(|(&row, predicted)| (noisy[row] - predicted).powi(2))
+            .filter(|change| change.is_finite())
+            .sum()
+    }
+
+    /// How many standard deviations a fitted change is away from what the stated coloured noise does by itself: its projection
+    /// on the change has the variance `cᵀΣc`, with Σ of an exponential memory and white noise. Infinite if none is stated.
+    pub fn deviations(&self, change: &[f64]) -> f64 {
+        let coloured = self.problem.coloured;
+        if !(coloured.rms > 0.0 && coloured.tau_s > 0.0) {
+            return f64::INFINITY;
+        }
+        let (mut energy, mut together, mut memory) = (0.0, 0.0, 0.0);
+        let mut last: Option<(f64, f64)> = None;
+        for (t, c) in self.t_s.iter().zip(change) {
+            if let Some((before, previous)) = last {
+                memory = (memory + previous) * (-(t - before).max(0.0) / coloured.tau_s).exp();
+            }
+            energy += c * c;
+            together += c * memory;
+            last = Some((*t, *c));
+        }
+        let variance = self.problem.noise.powi(2) * energy + 2.0 * coloured.rms.powi(2) * together;
+        energy / variance.max(1e-300).sqrt()
+    }
+
     /// The simulation at the rows that count.
     pub fn run(&self, model: &Model) -> Vec<f64> {
         self.thinned(self.everywhere(model))
@@ -242,6 +290,7 @@ impl<'a> Workbench<'a> {
     /// Whether the sub-step alignment is free in a model: an effect works on what is between the samples.
     pub fn aligns(&self, model: &Model) -> bool {
         matches!(self.problem.base, Base::Sensor(_))
+            && !model.unaligned
             && !model.has("delay")
             && model.members.iter().any(|member| {
                 matches!(member.effect.card().stage, Stage::Filter | Stage::Converter)

@@ -1,16 +1,21 @@
 //! The charge counter: differences of its readings over time, as mean currents.
 
-use super::{FEWEST_ROWS, Item, Purpose, Work, checks, series};
+use core_logic::design_parameters::METER_POLL_MS;
+
+use super::{FEWEST_ROWS, Item, Purpose, Work, checks, phase, series};
 use crate::{
     failure::Failure,
     model::Sensor,
-    problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View},
+    problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View},
     simulate::board::{Board, Pace},
 };
 
 /// Time over which two readings of the counter are compared if nothing is stated: a count of the board's small range is
 /// then 6.7 mA.
 const INTERVAL_S: f64 = 1.0;
+/// A reading can be older or younger than stated by a tick of the board, two of which make a period of the meter's polling:
+/// its start decides which tick tells first of a reading.
+const TICK_S: f64 = METER_POLL_MS as f64 * 0.5e-3;
 /// A mean current this many times beyond the largest reference is no charge but a counter that was set anew.
 const RESET: f64 = 3.0;
 
@@ -50,7 +55,7 @@ pub(super) fn item(
         .reference
         .iter()
         .fold(0.0_f64, |most, i| most.max(i.abs()));
-    let (drive, observed, rows, resets) =
+    let (drive, mut observed, rows, resets) =
         differences(drive, &readings, &rows, interval_s, step_c, largest);
     if resets > 0 {
         work.remark(format!(
@@ -73,8 +78,17 @@ pub(super) fn item(
         base.full_scale = Some(board.full_scale_a());
         base.range_limit = board.range_limit_a();
         base.range_ratio = board.range_ratio();
-        let reported = board.run(&drive, sensor.held_reference, &observed, Pace::Seen, true);
-        base.reading = means(&observed, &reported.charge_c);
+        let run = |later_s: f64| {
+            let mut earlier = observed.clone();
+            earlier.t_s.iter_mut().for_each(|t| *t -= later_s);
+            let mut reported = board.run(&drive, sensor.held_reference, &earlier, Pace::Seen, true);
+            reported.current_a = means(&earlier, &reported.charge_c);
+            reported
+        };
+        let slack_s = if spec.age_s > 0.0 { TICK_S } else { 0.0 };
+        let (later_s, reported) = phase::closest(0.0, (slack_s, 1), &observed, run);
+        observed.t_s.iter_mut().for_each(|t| *t -= later_s);
+        base.reading = reported.current_a;
         if drive.range_high.is_none() && board.has_two_ranges() {
             let (every, _) = series::every_row(&drive, &[]);
             let flag = board.run(&drive, sensor.held_reference, &every, Pace::Free, false);
@@ -91,6 +105,7 @@ pub(super) fn item(
         modelled: Vec::new(),
         // A difference has the noise of both of its readings.
         noise: std::f64::consts::SQRT_2 * noise_c / spacing_s,
+        coloured: Coloured::default(),
         accuracy: Accuracy {
             zero: sensor.accuracy.zero,
             gain: sensor.accuracy.gain,

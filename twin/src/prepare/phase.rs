@@ -2,27 +2,26 @@
 
 use crate::{problem::Observed, simulate::board::Reported};
 
-/// Trials over the slack, to either side.
-const TRIALS: i32 = 10;
 /// Share of the rows that counts: those that fit worst are left to whatever explains them.
 const COUNTED: f64 = 0.95;
 
-/// What the board reports if its readings are as old as makes them fit best, within `slack_s` of `age_s`: so far the rows
-/// cannot tell it. A gain and an offset of each range are not held against a fit.
+/// What the board reports if its readings are as old as makes them fit best, within `slack_s` of `age_s`, tried at so many
+/// ages to either side, and how old that is: so far the rows cannot tell it. A gain and an offset of each range are not held against a fit.
 pub(super) fn closest(
     age_s: f64,
-    slack_s: f64,
+    (slack_s, trials): (f64, i32),
     observed: &Observed,
     run: impl Fn(f64) -> Reported,
-) -> Reported {
-    let mut best = run(age_s);
-    let mut least = misfit(observed, &best);
+) -> (f64, Reported) {
+    let mut best = (age_s, run(age_s));
+    let mut least = misfit(observed, &best.1);
     if slack_s > 0.0 {
-        for trial in (-TRIALS..=TRIALS).filter(|trial| *trial != 0) {
-            let reported = run(age_s + slack_s * f64::from(trial) / f64::from(TRIALS));
+        for trial in (-trials..=trials).filter(|trial| *trial != 0) {
+            let trial_s = age_s + slack_s * f64::from(trial) / f64::from(trials);
+            let reported = run(trial_s);
             let now = misfit(observed, &reported);
             if now < least {
-                (best, least) = (reported, now);
+                (best, least) = ((trial_s, reported), now);
             }
         }
     }

@@ -409,8 +409,9 @@ fn ends(observed: &Observed, rows: std::ops::Range<usize>, period_s: f64) -> Vec
         .map(|pair| observed.t_s[pair[1]])
         .collect();
     match grid(&changes, period_s, step_s) {
+        // Rows come later by a little more than a step at most: the nearest to the middle of that.
         Some((grid_s, start_s)) => times()
-            .map(|t| start_s + ((t - start_s) / grid_s + 1e-6).floor() * grid_s)
+            .map(|t| start_s + ((t - start_s - 0.5 * step_s) / grid_s).round() * grid_s)
             .collect(),
         None => times().collect(),
     }
