@@ -188,7 +188,15 @@ fn one(
     vague(&bench, &mut selection, options.seed);
     let left = features.explain(&selection.fit.residual, options.seed);
     let confirmed = confirmed(&selection, problem, holdouts);
-    let verdict = judge(&bench, &mut selection, &features, confirmed, before, left, options.seed);
+    let verdict = judge(
+        &bench,
+        &mut selection,
+        &features,
+        confirmed,
+        before,
+        left,
+        options.seed,
+    );
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);

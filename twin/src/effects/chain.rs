@@ -1,6 +1,6 @@
 //! Runs the simulation with effects, in the order of their stages.
 
-use super::scene::{Scene, Steps, boxcar};
+use super::scene::{Scene, boxcar};
 use super::{Effect, Stage};
 use crate::problem::{Base, Problem, View};
 
@@ -22,7 +22,8 @@ pub type Members<'a> = [(&'static dyn Effect, &'a [f64])];
 #[derive(Debug)]
 pub struct Chain<'a> {
     problem: &'a Problem,
-    steps: Steps,
+    /// How every run begins.
+    start: Scene<'a>,
     /// The reading as designed less what this chain gives without effects: what the chain does not model itself.
     beside: Vec<f64>,
 }
@@ -38,7 +39,7 @@ enum Link<'m> {
     Sample,
     /// What the chain does not model itself.
     Beside,
-    /// The state of charge.
+    /// The state of charge and the open-circuit voltage.
     Count,
     /// The factor of resistance.
     Warm,
@@ -67,7 +68,7 @@ impl<'a> Chain<'a> {
     pub fn new(problem: &'a Problem) -> Self {
         let mut chain = Self {
             problem,
-            steps: Steps::new(&problem.drive.t_s, &problem.drive.segments),
+            start: Scene::new(problem),
             beside: Vec::new(),
         };
         if let Base::Sensor(base) = &problem.base
@@ -103,7 +104,7 @@ impl<'a> Chain<'a> {
         noise: &[f64],
     ) -> Vec<f64> {
         let links = self.links(members);
-        let mut scene = Scene::new(self.problem, &self.steps);
+        let mut scene = self.start.clone();
         for link in links {
             self.apply(&mut scene, link, nuisance);
             if matches!(link, Link::Beside) {
@@ -142,7 +143,7 @@ impl<'a> Chain<'a> {
         let mut order: Vec<usize> = (0..variations.len()).collect();
         order.sort_by_key(|k| first[*k]);
         let mut outputs = vec![Vec::new(); variations.len()];
-        let mut scene = Scene::new(self.problem, &self.steps);
+        let mut scene = self.start.clone();
         let mut done = 0;
         for k in order {
             for link in &links[done..first[k]] {
@@ -229,6 +230,9 @@ impl<'a> Chain<'a> {
                 if let Some(battery) = &mut scene.battery {
                     battery.soc_shift = nuisance.soc_shift;
                     battery.count(scene.drive, &scene.signal);
+                    if self.problem.view != View::StateOfCharge {
+                        battery.open_circuit();
+                    }
                 }
             }
             Link::Warm => {
@@ -239,10 +243,11 @@ impl<'a> Chain<'a> {
             Link::Terminals => {
                 if let Some(battery) = &mut scene.battery {
                     battery.resistance = 1.0 + nuisance.resistance;
-                    scene.signal = match self.problem.view {
-                        View::StateOfCharge => battery.soc.iter().map(|soc| 100.0 * soc).collect(),
-                        _ => battery.voltage(&scene.signal),
-                    };
+                    if self.problem.view == View::StateOfCharge {
+                        scene.signal = battery.soc.iter().map(|soc| 100.0 * soc).collect();
+                    } else {
+                        battery.voltage(&mut scene.signal);
+                    }
                 }
             }
         }

@@ -51,7 +51,7 @@ impl Effect for Diffusion {
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (ohms, tau) = (values[0], values[1]);
-        let (drive, steps) = (scene.drive, scene.steps);
+        let (drive, steps) = (scene.drive, scene.steps.clone());
         let Some(battery) = &mut scene.battery else {
             return;
         };

@@ -77,7 +77,7 @@ impl Effect for Polarisation {
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
-        let (drive, steps) = (scene.drive, scene.steps);
+        let (drive, steps) = (scene.drive, scene.steps.clone());
         let Some(battery) = &mut scene.battery else {
             return;
         };

@@ -1,6 +1,6 @@
 //! Coarser steps.
 
-use super::scene::{Scale, Scene};
+use super::scene::{Scale, Scene, rounded};
 use super::{Card, Clues, Effect, Mark, Parameter, Search, Stage};
 
 /// See [`CARD`].
@@ -52,7 +52,7 @@ impl Effect for Quantisation {
             scene
                 .signal
                 .iter_mut()
-                .for_each(|value| *value = step * (*value / step).round());
+                .for_each(|value| *value = step * rounded(*value / step));
         }
     }
 }

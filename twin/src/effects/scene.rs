@@ -1,7 +1,8 @@
 //! The simulation while effects act on it: series on the drive's rows, then on the observation's.
 
 use std::collections::HashMap;
-use std::ops::Range;
+use std::ops::{Deref, DerefMut, Range};
+use std::sync::Arc;
 
 use crate::problem::{Base, BatteryBase, Drive, Observed, Problem, SensorBase, View};
 
@@ -48,7 +49,7 @@ pub struct Scene<'a> {
     /// When readings were taken.
     pub observed: &'a Observed,
     /// Steps of the drive's rows.
-    pub steps: &'a Steps,
+    pub steps: Arc<Steps>,
     /// The signal: on drive rows before [`super::Stage::Output`], then on the observation's rows.
     pub signal: Vec<f64>,
     /// Transport delay in s.
@@ -59,6 +60,39 @@ pub struct Scene<'a> {
     pub sensor: Option<&'a SensorBase>,
     /// The battery in the making.
     pub battery: Option<Battery<'a>>,
+}
+
+/// A series that simulations share until one of them writes to it.
+#[derive(Clone, Debug, Default)]
+pub struct Series(Arc<Vec<f64>>);
+
+impl From<Vec<f64>> for Series {
+    fn from(values: Vec<f64>) -> Self {
+        Self(Arc::new(values))
+    }
+}
+
+impl Deref for Series {
+    type Target = [f64];
+
+    fn deref(&self) -> &[f64] {
+        &self.0
+    }
+}
+
+impl DerefMut for Series {
+    fn deref_mut(&mut self) -> &mut [f64] {
+        Arc::<Vec<f64>>::make_mut(&mut self.0)
+    }
+}
+
+impl<'s> IntoIterator for &'s Series {
+    type Item = &'s f64;
+    type IntoIter = std::slice::Iter<'s, f64>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.0.iter()
+    }
 }
 
 /// State of the battery simulation on drive rows; the scene's `signal` is the current in A.
@@ -75,13 +109,15 @@ pub struct Battery<'a> {
     /// Factor of the ohmic resistance by design.
     pub resistance: f64,
     /// State of charge, 0 … 1; filled between the stages of charge and temperature.
-    pub soc: Vec<f64>,
+    pub soc: Series,
+    /// Open-circuit voltage in V, from the state of charge.
+    open_circuit_v: Series,
     /// Temperature of the cell in °C.
-    pub temperature_c: Vec<f64>,
+    pub temperature_c: Series,
     /// Arrhenius temperature of the resistance in K, once known.
     pub arrhenius_k: Option<f64>,
     /// Factor on every resistance.
-    pub factor: Vec<f64>,
+    pub factor: Series,
     /// Voltage added to open circuit and ohmic drop, in V.
     pub added_v: Vec<f64>,
 }
@@ -94,6 +130,8 @@ pub struct Steps {
     kind: Vec<u32>,
     /// Length of each kind in s.
     length_s: Vec<f64>,
+    /// Length of every step of a segment, where they are all of one kind.
+    even_s: Vec<Option<f64>>,
 }
 
 impl Steps {
@@ -121,7 +159,23 @@ impl Steps {
                 kind[row] = slot.1;
             }
         }
-        Self { kind, length_s }
+        let even_s = segments
+            .iter()
+            .map(|rows| {
+                let kinds = kind.get(rows.start + 1..rows.end)?;
+                let first = *kinds.first().filter(|kind| **kind != 0)?;
+                let span_s = t_s[rows.end - 1] - t_s[rows.start];
+                kinds
+                    .iter()
+                    .all(|kind| *kind == first)
+                    .then_some(span_s / kinds.len() as f64)
+            })
+            .collect();
+        Self {
+            kind,
+            length_s,
+            even_s,
+        }
     }
 
     /// Weights of a first-order low-pass over each kind of step: of the last output, of the input where the step begins and of
@@ -156,12 +210,40 @@ impl Steps {
             return output;
         }
         let weights: Vec<[f64; 3]> = self.weights(tau_s, held).collect();
-        for rows in segments.iter().filter(|rows| !rows.is_empty()) {
-            let mut last = input[rows.start];
+        for (index, rows) in segments.iter().enumerate() {
+            let Some(mut last) = input[rows.clone()].first().copied() else {
+                continue;
+            };
             let after = rows.start + 1..rows.end;
-            let pairs = input[rows.clone()].windows(2);
-            for ((pair, out), kind) in pairs.zip(&mut output[after.clone()]).zip(&self.kind[after])
-            {
+            let input = &input[rows.clone()];
+            let output = &mut output[after.clone()];
+            let kinds = &self.kind[after];
+            // Each row waits for the one before it: of even steps four are made from one.
+            let fours = if self.even_s[index].is_some() {
+                output.len() / 4
+            } else {
+                0
+            };
+            let (even, output) = output.split_at_mut(4 * fours);
+            if let Some(kind) = kinds.first().filter(|_| fours > 0) {
+                let [kept, from, to] = weights[*kind as usize];
+                let powers = [kept, kept.powi(2), kept.powi(3), kept.powi(4)];
+                let inputs = input.windows(5).step_by(4);
+                for (out, x) in even.as_chunks_mut::<4>().0.iter_mut().zip(inputs) {
+                    let mut parts = [0.0; 4];
+                    let mut part = 0.0;
+                    for k in 0..4 {
+                        part = kept * part + (from * x[k] + to * x[k + 1]);
+                        parts[k] = part;
+                    }
+                    for k in 0..4 {
+                        out[k] = parts[k] + powers[k] * last;
+                    }
+                    last = out[3];
+                }
+            }
+            let left = input[4 * fours..].windows(2);
+            for ((pair, out), kind) in left.zip(output).zip(&kinds[4 * fours..]) {
                 let [kept, from, to] = weights[*kind as usize];
                 last = kept * last + (from * pair[0] + to * pair[1]);
                 *out = last;
@@ -331,9 +413,60 @@ pub fn boxcar(
     output
 }
 
+/// A series of even steps, later by some steps; straight lines between rows, the first and last value beyond the ends.
+fn moved(series: &[f64], steps: f64, out: &mut [f64]) {
+    let (Some(first), Some(last)) = (series.first(), series.last()) else {
+        return;
+    };
+    let count = series.len() as isize;
+    let whole = steps.floor().clamp(-count as f64, count as f64);
+    let share = 1.0 - (steps - whole).clamp(0.0, 1.0);
+    let whole = whole as isize;
+    let begin = (whole + 1).clamp(0, count) as usize;
+    let end = (count + whole).clamp(begin as isize, count) as usize;
+    out[..begin].fill(*first);
+    out[end..].fill(*last);
+    let pairs = series
+        .get((begin as isize - whole - 1).max(0) as usize..)
+        .unwrap_or_default()
+        .windows(2);
+    for (out, pair) in out[begin..end].iter_mut().zip(pairs) {
+        *out = pair[0] + (pair[1] - pair[0]) * share;
+    }
+}
+
+/// A series of even steps at another rate, and later by some steps.
+fn stretched(series: &[f64], rate: f64, steps: f64, out: &mut [f64]) {
+    let (Some(first), Some(last)) = (series.first(), series.last()) else {
+        return;
+    };
+    for (row, out) in out.iter_mut().enumerate() {
+        let at = row as f64 * rate - steps;
+        let whole = at as usize;
+        *out = match (series.get(whole), series.get(whole + 1)) {
+            (Some(here), Some(next)) if at > 0.0 => here + (next - here) * (at - whole as f64),
+            (Some(_), _) if at <= 0.0 => *first,
+            _ => *last,
+        };
+    }
+}
+
+/// [`f64::round`] of what is less than 2⁵² in size, without a call.
+pub fn rounded(value: f64) -> f64 {
+    /// The largest number below a half.
+    const HALF: f64 = 0.499_999_999_999_999_94;
+    (value + HALF.copysign(value)) as i64 as f64
+}
+
+/// [`f64::floor`] of what is less than 2⁵² in size, without a call.
+pub fn floored(value: f64) -> f64 {
+    let whole = value as i64 as f64;
+    if whole > value { whole - 1.0 } else { whole }
+}
+
 impl<'a> Scene<'a> {
     /// The simulation before any effect.
-    pub fn new(problem: &'a Problem, steps: &'a Steps) -> Self {
+    pub fn new(problem: &'a Problem) -> Self {
         let drive = &problem.drive;
         let (sensor, battery) = match &problem.base {
             Base::Sensor(base) => (Some(base), None),
@@ -342,7 +475,7 @@ impl<'a> Scene<'a> {
         Self {
             drive,
             observed: &problem.observed,
-            steps,
+            steps: Arc::new(Steps::new(&drive.t_s, &drive.segments)),
             signal: drive.reference.clone(),
             delay_s: 0.0,
             skew: 0.0,
@@ -386,9 +519,26 @@ impl<'a> Scene<'a> {
                 continue;
             };
             let start = drive.t_s[rows.start];
+            // Rows of even steps: all of them move by the same part of a step.
+            let even_rows = if observed.on_drive_rows && !held && total.is_none() {
+                (rows.start, rows.end)
+            } else {
+                (0, 0)
+            };
             let mut cursor = Cursor::new(&drive.t_s, rows);
             let times = &observed.t_s[these.clone()];
             let values = &mut sampled[these.clone()];
+            if let Some(Some(step_s)) = self.steps.even_s.get(readings[0])
+                && (these.start, these.end) == even_rows
+            {
+                let steps = delay_s / step_s;
+                if skew == 1.0 {
+                    moved(&self.signal[these], steps, values);
+                } else {
+                    stretched(&self.signal[these], 1.0 / skew, steps, values);
+                }
+                continue;
+            }
             // What the sensor's clock calls t was at this time.
             let reference_s = |t: f64| start + (t - start) / skew - delay_s;
             let Some(total) = &total else {
@@ -436,10 +586,11 @@ impl<'a> Battery<'a> {
             },
             soc_shift: 0.0,
             resistance: 1.0,
-            soc: Vec::new(),
-            temperature_c,
+            soc: Series::default(),
+            open_circuit_v: Series::default(),
+            temperature_c: temperature_c.into(),
             arrhenius_k: None,
-            factor: vec![1.0; rows],
+            factor: vec![1.0; rows].into(),
             added_v: vec![0.0; rows],
         }
     }
@@ -463,13 +614,26 @@ impl<'a> Battery<'a> {
         {
             let first = self.base.initial_soc.get(index).copied().unwrap_or(1.0) + self.soc_shift;
             soc[rows.start] = first;
-            for row in rows.clone().skip(1) {
-                let h = drive.t_s[row] - drive.t_s[row - 1];
-                let mean = 0.5 * (flow(current_a[row]) + flow(current_a[row - 1]));
-                soc[row] = soc[row - 1] - mean * h * per_as;
+            let (mut last, mut before) = (first, flow(current_a[rows.start]));
+            let after = rows.start + 1..rows.end;
+            let steps = drive.t_s[rows.clone()].windows(2);
+            for ((soc, current), times) in soc[after.clone()]
+                .iter_mut()
+                .zip(&current_a[after])
+                .zip(steps)
+            {
+                let here = flow(*current);
+                let mean = 0.5 * (here + before);
+                last -= mean * (times[1] - times[0]) * per_as;
+                (*soc, before) = (last, here);
             }
         }
-        self.soc = soc;
+        self.soc = soc.into();
+    }
+
+    /// Looks up the open-circuit voltage: after the charge is counted.
+    pub fn open_circuit(&mut self) {
+        self.open_circuit_v = open_circuit_v(&self.base.ocv, &self.soc).into();
     }
 
     /// What temperature does to the resistance: after the stage of temperature.
@@ -481,45 +645,54 @@ impl<'a> Battery<'a> {
         }
     }
 
-    /// The voltage from everything: open circuit, ohmic drop and what was added.
-    pub fn voltage(&self, current_a: &[f64]) -> Vec<f64> {
+    /// The voltage from everything, in place of the current: open circuit, ohmic drop and what was added.
+    pub fn voltage(&self, signal: &mut [f64]) {
         let ohms = self.base.resistance_ohm * self.resistance;
-        let table = &self.base.ocv;
-        let mut at = 0;
-        self.soc
-            .iter()
-            .enumerate()
-            .map(|(row, soc)| {
-                open_circuit_v(table, *soc, &mut at) - ohms * self.factor[row] * current_a[row]
-                    + self.added_v[row]
-            })
-            .collect()
+        for (((value, open_v), factor), added_v) in signal
+            .iter_mut()
+            .zip(&self.open_circuit_v)
+            .zip(&self.factor)
+            .zip(&self.added_v)
+        {
+            *value = open_v - ohms * factor * *value + added_v;
+        }
     }
 }
 
 /// Factor of a resistance of Arrhenius temperature `b_k`, in K, from 25 °C to a temperature.
 pub fn arrhenius(b_k: f64, temperature_c: f64) -> f64 {
-    let inverse =
-        1.0 / (temperature_c + ZERO_CELSIUS_K) - 1.0 / (REFERENCE_C + ZERO_CELSIUS_K);
+    let inverse = 1.0 / (temperature_c + ZERO_CELSIUS_K) - 1.0 / (REFERENCE_C + ZERO_CELSIUS_K);
     (b_k * inverse).exp()
 }
 
-/// Straight lines between the points of the table and beyond its ends; `at` is where the last look-up ended.
-fn open_circuit_v(table: &[(f64, f64)], soc: f64, at: &mut usize) -> f64 {
+/// Straight lines between the points of the table and beyond its ends.
+fn open_circuit_v(table: &[(f64, f64)], soc: &[f64]) -> Vec<f64> {
     match table {
-        [] => 0.0,
-        [only] => only.1,
+        [] => vec![0.0; soc.len()],
+        [only] => vec![only.1; soc.len()],
         _ => {
             let last = table.len() - 2;
-            *at = (*at).min(last);
-            while *at > 0 && table[*at].0 > soc {
-                *at -= 1;
-            }
-            while *at < last && table[*at + 1].0 <= soc {
-                *at += 1;
-            }
-            let (from, to) = (table[*at], table[*at + 1]);
-            from.1 + (to.1 - from.1) * (soc - from.0) / (to.0 - from.0)
+            // The line in use, and where it ends.
+            let (mut at, mut low, mut high) = (0, f64::INFINITY, f64::NEG_INFINITY);
+            let (mut from, mut slope) = (table[0], 0.0);
+            soc.iter()
+                .map(|&soc| {
+                    if !(low <= soc && soc < high) {
+                        while at > 0 && table[at].0 > soc {
+                            at -= 1;
+                        }
+                        while at < last && table[at + 1].0 <= soc {
+                            at += 1;
+                        }
+                        let to = table[at + 1];
+                        from = table[at];
+                        slope = (to.1 - from.1) / (to.0 - from.0);
+                        low = if at == 0 { f64::NEG_INFINITY } else { from.0 };
+                        high = if at == last { f64::INFINITY } else { to.0 };
+                    }
+                    from.1 + slope * (soc - from.0)
+                })
+                .collect()
         }
     }
 }
@@ -541,6 +714,50 @@ mod tests {
         let t_s: Vec<f64> = (0..2000).map(|k| f64::from(k) * 0.01).collect();
         let output = boxcar(&t_s, &[0..2000], &t_s, 0.333, false);
         assert!((output[1999] - (t_s[1999] - 0.1665)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_series_of_even_steps_moves_as_any_other() {
+        let t_s: Vec<f64> = (0..50).map(|k| f64::from(k) * 0.1).collect();
+        let series: Vec<f64> = t_s.iter().map(|t| (7.0 * t).sin()).collect();
+        for steps in [
+            -60.0, -50.0, -49.5, -7.0, -1.3, -0.2, 0.0, 0.4, 1.0, 2.6, 48.9, 49.0, 50.0, 70.2,
+        ] {
+            for rate in [1.0, 0.8, 1.1] {
+                let mut out = vec![f64::NAN; 50];
+                if rate == 1.0 {
+                    moved(&series, steps, &mut out);
+                } else {
+                    stretched(&series, rate, steps, &mut out);
+                }
+                let mut cursor = Cursor::new(&t_s, 0..50);
+                for (out, t) in out.iter().zip(&t_s) {
+                    let there = cursor.value(&series, rate * t - 0.1 * steps, false);
+                    assert!((out - there).abs() < 1e-9, "{steps} {rate} {t}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn rounding_without_a_call_is_the_same() {
+        for value in [
+            0.0,
+            0.5,
+            1.5,
+            2.5,
+            0.499_999_999_999_999_94,
+            1e9 + 0.5,
+            3.0,
+            3.2,
+            3.7,
+            1e15 + 0.5,
+        ] {
+            for value in [value, -value] {
+                assert_eq!(rounded(value), value.round());
+                assert_eq!(floored(value), value.floor());
+            }
+        }
     }
 
     #[test]

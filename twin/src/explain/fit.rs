@@ -11,6 +11,8 @@ use crate::problem::Base;
 
 /// Residuals beyond this many standard deviations count by their size, not by its square (Huber).
 pub const TUNING: f64 = 3.0;
+/// Sums that are kept side by side.
+const LANES: usize = 8;
 /// Steps of Levenberg–Marquardt in one go.
 const STEPS: usize = 14;
 /// A step that lowers the loss by a smaller share calls for a new slope.
@@ -99,16 +101,33 @@ pub fn spread(residual: &[f64]) -> f64 {
 /// Huber's loss of a residual in units of sigma.
 pub fn huber(z: f64) -> f64 {
     let size = z.abs();
-    if size <= TUNING {
-        0.5 * z * z
-    } else {
-        TUNING * (size - 0.5 * TUNING)
-    }
+    // The part of it that counts by its square.
+    let inner = size.min(TUNING);
+    inner * (size - 0.5 * inner)
 }
 
 fn weight(z: f64) -> f64 {
-    let size = z.abs();
-    if size <= TUNING { 1.0 } else { TUNING / size }
+    TUNING / z.abs().max(TUNING)
+}
+
+/// Sum of what a function makes of two series, in lanes.
+fn sum_of(a: &[f64], b: &[f64], part: impl Fn(f64, f64) -> f64) -> f64 {
+    let (a_chunks, a_rest) = a.as_chunks::<LANES>();
+    let (b_chunks, b_rest) = b.as_chunks::<LANES>();
+    let mut lanes = [0.0; LANES];
+    for (x, y) in a_chunks.iter().zip(b_chunks) {
+        for lane in 0..LANES {
+            lanes[lane] += part(x[lane], y[lane]);
+        }
+    }
+    let rest: f64 = a_rest.iter().zip(b_rest).map(|(x, y)| part(*x, *y)).sum();
+    lanes.iter().sum::<f64>() + rest
+}
+
+/// Huber's loss of residuals.
+pub fn loss(residual: &[f64], sigma: f64) -> f64 {
+    let per_sigma = 1.0 / sigma;
+    sum_of(residual, residual, |r, _| huber(r * per_sigma))
 }
 
 /// Derivatives of the simulation by each free coordinate, at the rows that count.
@@ -394,20 +413,7 @@ pub fn normal(
 
 /// Sum of products, in lanes.
 pub fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let mut lanes = [0.0f64; 8];
-    let (a_chunks, b_chunks) = (a.chunks_exact(8), b.chunks_exact(8));
-    let rest: f64 = a_chunks
-        .remainder()
-        .iter()
-        .zip(b_chunks.remainder())
-        .map(|(x, y)| x * y)
-        .sum();
-    for (x, y) in a_chunks.zip(b_chunks) {
-        for lane in 0..8 {
-            lanes[lane] += x[lane] * y[lane];
-        }
-    }
-    lanes.iter().sum::<f64>() + rest
+    sum_of(a, b, |x, y| x * y)
 }
 
 /// A normal matrix made ready to be solved, with a little damping, scaled by the diagonal.
@@ -476,13 +482,10 @@ fn cost(
     sigma: f64,
     used: Option<&[f64]>,
 ) -> f64 {
-    let loss: f64 = match used {
-        None => residual.iter().map(|r| huber(r / sigma)).sum(),
-        Some(used) => residual
-            .iter()
-            .zip(used)
-            .map(|(r, use_it)| use_it * huber(r / sigma))
-            .sum(),
+    let per_sigma = 1.0 / sigma;
+    let loss = match used {
+        None => loss(residual, sigma),
+        Some(used) => sum_of(residual, used, |r, used| used * huber(r * per_sigma)),
     };
     let penalty: f64 = coordinates(bench, model)
         .iter()
@@ -589,13 +592,17 @@ fn descend(
     let mut steps = 0;
     while steps < STEPS && !slope.is_empty() {
         steps += 1;
-        let weights: Vec<f64> = residual
+        let (per_sigma, per_square) = (1.0 / sigma, 1.0 / (sigma * sigma));
+        let mut weights: Vec<f64> = residual
             .iter()
-            .enumerate()
-            .map(|(row, r)| {
-                weight(r / sigma) / (sigma * sigma) * used.map_or(1.0, |used| used[row])
-            })
+            .map(|r| weight(r * per_sigma) * per_square)
             .collect();
+        if let Some(used) = used {
+            weights
+                .iter_mut()
+                .zip(used)
+                .for_each(|(weight, used)| *weight *= used);
+        }
         let (mut matrix, mut right) = normal(&slope.columns, &weights, residual, 0..bench.len());
         slope.penalty(&mut matrix, &mut right);
         let mut gain = 0.0;

@@ -240,8 +240,7 @@ impl<'a> Workbench<'a> {
             together += c * memory;
             last = Some((*t, *c));
         }
-        let variance = self.problem.noise.powi(2) * energy
-            + 2.0 * coloured.rms.powi(2) * together;
+        let variance = self.problem.noise.powi(2) * energy + 2.0 * coloured.rms.powi(2) * together;
         energy / variance.max(1e-300).sqrt()
     }
 
