@@ -30,7 +30,8 @@ impl Effect for CoreHysteresis {
 
     fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64) {
         if parameter == 0 {
-            (-0.2 * scale.full_scale, 0.2 * scale.full_scale)
+            // A core that keeps a field keeps it in the direction of the current.
+            (0.0, 0.2 * scale.full_scale)
         } else {
             (1e-3 * scale.full_scale, 0.5 * scale.full_scale)
         }
