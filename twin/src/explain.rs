@@ -16,6 +16,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use crate::effects::chain::{Chain, Nuisance};
+use crate::effects::scene::Scale;
 use crate::effects::{Effect, Search, Stage, find, find_with};
 use crate::problem::Problem;
 use crate::report::data::{
@@ -324,40 +325,118 @@ fn veto(bench: &Workbench<'_>, selection: &mut Selection, problem: &Problem, hol
     }
 }
 
-/// Takes effects out again whose values the recording does not tell to within orders of magnitude.
+/// Takes effects out again whose values the recording does not tell; where others would do as well, the best of those whose
+/// values it does tell takes the place.
 fn vague(bench: &Workbench<'_>, selection: &mut Selection, seed: u64) {
     while !selection.named.is_empty() {
         let intervals = intervals::intervals(bench, &selection.fit, seed);
         let members = &selection.fit.model.members;
-        let found = members
-            .iter()
-            .zip(&intervals)
-            .position(|(member, intervals)| {
-                // Where one value is told (a knee), another (how soft it is) need not be.
-                let mut scales = member
-                    .effect
-                    .card()
-                    .parameters
-                    .iter()
-                    .zip(intervals)
-                    .filter(|(parameter, _)| {
-                        parameter.search == Search::Logarithmic && !parameter.internal
-                    })
-                    .map(|(_, [low, high])| *high > VAGUE * low)
-                    .peekable();
-                scales.peek().is_some() && scales.all(|vague| vague)
-            });
-        let Some(index) = found else {
+        let found =
+            members
+                .iter()
+                .zip(&intervals)
+                .enumerate()
+                .find_map(|(index, (member, intervals))| {
+                    Some((index, untold(&bench.scale, member, intervals)?))
+                });
+        let Some((index, why)) = found else {
             return;
         };
+        let id = members[index].id();
         selection.refused.push(format!(
-            "{}: fits, but this recording does not tell its values",
-            members[index].id()
+            "{id}: fits, but this recording does not tell its values: {why}"
         ));
         let without = fit::fit(bench, &selection.fit.model.without(index), None);
-        selection.fit = fit::polish(bench, &without);
+        match stand_in(bench, selection, &without.model, index, seed) {
+            Some(better) => {
+                selection.decisions.push(format!(
+                    "{} instead of {id}: as good, and the recording tells its values.",
+                    better.model.members.last().map_or("", Member::id)
+                ));
+                selection.take(index, better);
+            }
+            None => selection.fit = fit::polish(bench, &without),
+        }
         selection.rename(bench);
     }
+}
+
+/// The best of what would have done as well in the place of an effect that was taken out, if the recording tells its values.
+fn stand_in(
+    bench: &Workbench<'_>,
+    selection: &Selection,
+    without: &Model,
+    index: usize,
+    seed: u64,
+) -> Option<Fit> {
+    let named = selection.named.iter().find(|one| one.index == index)?;
+    let clues = bench.clues(&selection.fit.predicted);
+    named
+        .equivalent
+        .iter()
+        .filter(|id| !without.has(id))
+        .filter_map(|id| find(id))
+        .flat_map(|effect| {
+            effect
+                .starts(&bench.scale, &clues)
+                .into_iter()
+                .map(move |values| Member { effect, values })
+        })
+        .map(|member| fit::fit(bench, &without.with(member), None))
+        .filter(|fit| {
+            let last = fit.model.members.len() - 1;
+            let intervals = intervals::intervals(bench, fit, seed);
+            untold(&bench.scale, &fit.model.members[last], &intervals[last]).is_none()
+        })
+        .min_by(|a, b| a.cost.total_cmp(&b.cost))
+        .map(|fit| fit::polish(bench, &fit))
+}
+
+/// Why the recording does not tell an effect's values: an interval over orders of magnitude or over all that is physics, or
+/// every size that the effect has could as well be none.
+fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<String> {
+    let parameters = member.effect.card().parameters;
+    let known = || {
+        parameters
+            .iter()
+            .zip(intervals)
+            .enumerate()
+            .filter(|(_, (parameter, _))| !parameter.internal)
+    };
+    // Where one size is told (a knee), another (how soft it is) need not be.
+    let mut sizes = known()
+        .filter(|(_, (parameter, _))| parameter.search == Search::Logarithmic)
+        .map(|(_, (_, [low, high]))| *high > VAGUE * low)
+        .peekable();
+    let vague = sizes.peek().is_some() && sizes.all(|vague| vague);
+    for (index, (parameter, [low, high])) in known() {
+        let (lowest, highest) = member.effect.bounds(index, scale);
+        let magnitudes = vague && parameter.search == Search::Logarithmic;
+        let whole = !parameter.open && low <= &lowest && high >= &highest;
+        if magnitudes || whole {
+            return Some(format!(
+                "{} could be {} … {}",
+                parameter.name,
+                short(*low),
+                short(*high)
+            ));
+        }
+    }
+    let sizes: Vec<_> = known()
+        .filter(|(_, (parameter, _))| {
+            parameter.search == Search::Linear && parameter.off.is_finite()
+        })
+        .collect();
+    let none = |(parameter, [low, high]): (&crate::effects::Parameter, &[f64; 2])| {
+        (*low..=*high).contains(&parameter.off)
+    };
+    (!sizes.is_empty() && sizes.iter().all(|(_, pair)| none(*pair))).then(|| {
+        format!(
+            "{} could as well be {}",
+            sizes[0].1.0.name,
+            short(sizes[0].1.0.off)
+        )
+    })
 }
 
 /// The model as it is taken to another file: how a file starts is its own, the physics is not.
@@ -791,5 +870,49 @@ fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
             .map(|member| (member.id().to_owned(), values(member)))
             .collect(),
         nuisance: fit.model.nuisance,
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_recording_does_not_tell_is_told_from_what_it_does() {
+        let scale = Scale {
+            full_scale: 600.0,
+            largest: 400.0,
+            rms: 100.0,
+            step_s: 0.1,
+            reading_step_s: 0.1,
+            span_s: 1000.0,
+            capacity_ah: 50.0,
+            ..Scale::default()
+        };
+        let says = |id: &str, intervals: &[[f64; 2]]| {
+            let effect = find(id).unwrap();
+            let values = intervals.iter().map(|[low, high]| 0.5 * (low + high));
+            let member = Member {
+                effect,
+                values: values.collect(),
+            };
+            untold(&scale, &member, intervals)
+        };
+        assert_eq!(says("offset", &[[0.1, 0.3]]), None);
+        assert!(
+            says("offset", &[[-0.1, 0.3]])
+                .unwrap()
+                .contains("offset_a could as well be 0")
+        );
+        // One size is enough.
+        assert_eq!(says("range-mismatch", &[[1.01, 1.02], [-0.1, 0.1]]), None);
+        assert!(says("range-mismatch", &[[0.99, 1.02], [-0.1, 0.1]]).is_some());
+        assert!(says("coulombic-efficiency", &[[-1.0, 12.0]]).is_some());
+        assert_eq!(says("coulombic-efficiency", &[[0.97, 0.99]]), None);
+        assert_eq!(says("lag", &[[0.1, 0.4]]), None);
+        assert!(says("lag", &[[0.01, 2.0]]).unwrap().contains("tau_s"));
+        assert!(says("ocv-hysteresis", &[[-3.0, 1.8], [1e-6, 1e-5]]).is_some());
+        assert_eq!(says("ocv-hysteresis", &[[0.01, 0.02], [60.0, 300.0]]), None);
     }
 }

@@ -156,6 +156,7 @@ fn a_cells_slow_polarisation_is_found_on_hwfet_and_holds_on_us06() {
         "--holdout",
         "../recordings/panasonic-18650pf/25c-us06.csv",
     ]);
+    only_what_the_recording_tells(&report);
     assert!(
         names(&report, "polarisation") || names(&report, "diffusion"),
         "{}",
@@ -168,4 +169,150 @@ fn a_cells_slow_polarisation_is_found_on_hwfet_and_holds_on_us06() {
         "{}",
         left_on_other_file(&report)
     );
+}
+
+/// A pulse test; the discharges at 1C are other days' tests of the same kind of cell. Open-circuit voltage and capacity were
+/// read off the pulse test: only what takes time can be missing.
+#[test]
+fn a_leaf_cells_slow_polarisation_is_found_in_pulses_and_holds_in_discharges() {
+    let report = explain(&[
+        "--model",
+        "../models/leaf-cell.toml",
+        "--recording",
+        "../recordings/leaf-cell/hppc-25c.csv",
+        "--holdout",
+        "../recordings/leaf-cell/1c-discharge.csv",
+    ]);
+    assert!(
+        names(&report, "polarisation") || names(&report, "diffusion"),
+        "{}",
+        report["summary"]
+    );
+    assert!(
+        left_on_blocks(&report) < 0.92,
+        "{}",
+        left_on_blocks(&report)
+    );
+    assert!(
+        left_on_other_file(&report) < 0.65,
+        "{}",
+        left_on_other_file(&report)
+    );
+    only_what_the_recording_tells(&report);
+}
+
+/// Effects that act by the clock: the loops are quasi-static, so none of them can be there.
+const TIMED: [&str; 8] = [
+    "lag",
+    "delay",
+    "moving-average",
+    "clock-skew",
+    "sampled-window",
+    "sensor-self-heating",
+    "hum",
+    "range-handover",
+];
+
+/// Some loops of a file, as a recording of a sensor that should follow its field: a second for each point.
+fn loops(file: &str, which: &[u32], out: &Path) {
+    let path = format!(
+        "{}/../recordings/bh-loops/{file}",
+        env!("CARGO_MANIFEST_DIR")
+    );
+    let table = recording::csv::read_table(Path::new(&path)).unwrap();
+    let column = |name: &str| table.column(name).unwrap();
+    let (number, h, b) = (column("loop"), column("h_a_per_m"), column("b_t"));
+    let smallest = |of: &[f64]| {
+        let tip = of.iter().zip(number).filter(|(_, loop_)| **loop_ == 1.0);
+        tip.fold(0.0_f64, |most, (value, _)| most.max(*value))
+    };
+    let a_per_m_per_t = smallest(h) / smallest(b);
+    let mut text = "t_s,cycle,h_a_per_m,b_a_per_m\n".to_owned();
+    for which in which {
+        let rows = (0..h.len()).filter(|row| number[*row] == f64::from(*which));
+        for (second, row) in rows.enumerate() {
+            let b_a_per_m = b[row] * a_per_m_per_t;
+            text.push_str(&format!("{second},{which},{},{b_a_per_m:.5}\n", h[row]));
+        }
+    }
+    fs::write(out, text).unwrap();
+}
+
+/// The smallest and the largest loop fitted, the one between them never.
+fn explain_loops(file: &str, timed: bool) -> Value {
+    let folder = tempfile::tempdir().unwrap();
+    let (fitted, held) = (folder.path().join("1-3.csv"), folder.path().join("2.csv"));
+    loops(file, &[1, 3], &fitted);
+    loops(file, &[2], &held);
+    let mut arguments = vec![
+        "--model",
+        "../models/bh-loop.toml",
+        "--recording",
+        fitted.to_str().unwrap(),
+        "--holdout",
+        held.to_str().unwrap(),
+    ];
+    if !timed {
+        arguments.extend(TIMED.iter().flat_map(|id| ["--without", id]));
+    }
+    explain(&arguments)
+}
+
+/// Ferrite: rounded tips and a wide loop.
+#[test]
+fn a_ferrites_loops_are_saturation_and_hysteresis() {
+    let report = explain_loops("mnzn-ferrite.csv", false);
+    assert!(names(&report, "core-saturation"), "{}", report["summary"]);
+    assert!(names(&report, "core-hysteresis"), "{}", report["summary"]);
+    assert!(
+        left_on_blocks(&report) < 0.65,
+        "{}",
+        left_on_blocks(&report)
+    );
+    assert!(
+        left_on_other_file(&report) < 0.85,
+        "{}",
+        left_on_other_file(&report)
+    );
+}
+
+/// Electrical steel: 1.5 T, far into saturation, beside which the loop is narrow.
+#[test]
+fn an_electrical_steels_loops_are_saturation() {
+    let report = explain_loops("m130-27s.csv", false);
+    assert!(names(&report, "core-saturation"), "{}", report["summary"]);
+    assert!(left_on_blocks(&report) < 0.2, "{}", left_on_blocks(&report));
+    assert!(
+        left_on_other_file(&report) < 0.7,
+        "{}",
+        left_on_other_file(&report)
+    );
+}
+
+/// Where the clock may be a reason, a loop and a delay look alike: that must not be said for certain.
+#[test]
+fn a_loop_without_a_time_is_not_a_delay_for_certain() {
+    for file in ["mnzn-ferrite.csv", "m130-27s.csv"] {
+        let report = explain_loops(file, true);
+        assert_ne!(report["verdict"], "explained", "{}", report["summary"]);
+        assert_ne!(report["verdict"], "no-mismatch", "{}", report["summary"]);
+    }
+}
+
+/// No effect whose interval takes in all that is physics, or for each of its sizes none at all.
+fn only_what_the_recording_tells(report: &Value) {
+    for effect in effects(report) {
+        let parameters = effect["parameters"].as_array().unwrap();
+        let could_be_off = |one: &Value| {
+            let end = |index: usize| one["ci95"][index].as_f64().unwrap();
+            one["off"]
+                .as_f64()
+                .is_some_and(|off| end(0) <= off && off <= end(1))
+        };
+        assert!(
+            !parameters.iter().all(could_be_off),
+            "{}: {parameters:?}",
+            effect["id"]
+        );
+    }
 }

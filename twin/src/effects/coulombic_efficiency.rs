@@ -29,7 +29,8 @@ impl Effect for CoulombicEfficiency {
     }
 
     fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {
-        (0.5, 1.2)
+        // More than comes back is noise.
+        (0.5, 1.02)
     }
 
     fn starts(&self, _scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {

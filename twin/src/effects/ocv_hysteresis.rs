@@ -4,6 +4,21 @@ use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
+/// Half of the widest gap between the branches of a common cell, in V: nickel–metal hydride; of lithium ion it is a tenth of that.
+const LARGEST_V: f64 = 0.2;
+/// Largest γ: the state follows the current within a five-thousandth of the capacity.
+const FASTEST: f64 = 5000.0;
+/// Times that the charge moved in a recording has to be the charge in which the state follows: then it comes to its end. A
+/// state that does not is a drift with the charge, and nothing in the recording says that it is hysteresis.
+const ENDS: f64 = 3.0;
+
+/// Smallest γ with which the state comes to its end within the recording.
+fn slowest(scale: &Scale) -> f64 {
+    // No less than what was moved: the mean magnitude of a current is below its root mean square.
+    let moved_ah = scale.rms * scale.span_s / 3600.0;
+    ENDS * scale.capacity_ah / moved_ah.max(f64::MIN_POSITIVE)
+}
+
 /// See [`CARD`].
 #[derive(Debug)]
 pub struct OcvHysteresis;
@@ -31,16 +46,20 @@ impl Effect for OcvHysteresis {
         problem.view == View::Voltage
     }
 
-    fn bounds(&self, parameter: usize, _scale: &Scale) -> (f64, f64) {
+    fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64) {
         if parameter == 0 {
-            (-0.5, 0.5)
+            (0.0, LARGEST_V)
         } else {
-            (0.5, 5000.0)
+            (slowest(scale).min(FASTEST), FASTEST)
         }
     }
 
-    fn starts(&self, _scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
-        spaced(3.0, 1000.0, 6)
+    fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        let slowest = slowest(scale);
+        if slowest >= FASTEST {
+            return Vec::new();
+        }
+        spaced(slowest.max(3.0), (2.0 * slowest).max(1000.0), 6)
             .into_iter()
             .map(|gamma| vec![0.005, gamma])
             .collect()

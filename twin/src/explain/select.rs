@@ -71,6 +71,15 @@ pub struct Selection {
 }
 
 impl Selection {
+    /// Has another effect, the last of `fit`, in the place of the one at `index`: it was as good at the same step.
+    pub fn take(&mut self, index: usize, fit: Fit) {
+        let place = self.named.iter().position(|named| named.index == index);
+        if let (Some(place), Some(last)) = (place, fit.model.members.last()) {
+            self.ids[place] = last.id();
+        }
+        self.fit = fit;
+    }
+
     /// Asks anew what speaks for each effect, after the model was changed.
     pub fn rename(&mut self, bench: &Workbench<'_>) {
         let p99: Vec<(&'static str, f64)> = self

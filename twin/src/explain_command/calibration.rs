@@ -296,8 +296,11 @@ mod tests {
 
     const BOARD: &str = "schema = 1\n[sensor]\nfront_end = \"dual-range\"\n[charge]\n";
 
+    /// Signal, effect and its values.
+    type Found<'a> = (&'a str, &'a str, &'a [(&'a str, f64)]);
+
     /// The file's values by name, and the remarks, after these effects were found.
-    fn found(effects: &[(&str, &str, &[(&str, f64)])]) -> (toml::Table, Vec<String>) {
+    fn found(effects: &[Found<'_>]) -> (toml::Table, Vec<String>) {
         let model = Model::parse("m.toml", BOARD.to_owned(), Path::new("")).unwrap();
         let mut report = Report {
             schema: 1,

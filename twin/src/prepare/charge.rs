@@ -113,7 +113,8 @@ pub(super) fn item(
         coloured: Coloured::default(),
         accuracy: Accuracy {
             zero: sensor.accuracy.zero,
-            gain: sensor.accuracy.gain,
+            // What an uncertain moment moves a difference by is no physics either.
+            gain: sensor.accuracy.gain + spec.jitter_s / 6f64.sqrt() / spacing_s,
         },
     };
     Ok(Some(Item {

@@ -393,6 +393,9 @@ impl Board {
     }
 }
 
+/// Share of a step between rows by which a row may seem to come before its conversion.
+const EARLY: f64 = 0.25;
+
 /// When the conversions ended that valid rows saw for the first time: on a grid of their own if the changes of the
 /// reading fit one, else at the rows.
 fn ends(observed: &Observed, rows: std::ops::Range<usize>, period_s: f64) -> Vec<f64> {
@@ -409,9 +412,10 @@ fn ends(observed: &Observed, rows: std::ops::Range<usize>, period_s: f64) -> Vec
         .map(|pair| observed.t_s[pair[1]])
         .collect();
     match grid(&changes, period_s, step_s) {
-        // Rows come later by a little more than a step at most: the nearest to the middle of that.
+        // The grid is known to a part of a step only. A row can come much later, where a value was the same again, and never
+        // before its conversion.
         Some((grid_s, start_s)) => times()
-            .map(|t| start_s + ((t - start_s - 0.5 * step_s) / grid_s).round() * grid_s)
+            .map(|t| start_s + ((t - start_s + EARLY * step_s) / grid_s).floor() * grid_s)
             .collect(),
         None => times().collect(),
     }
