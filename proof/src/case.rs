@@ -195,6 +195,9 @@ pub struct Truth {
     /// Where the effect acts.
     #[serde(default, rename = "where")]
     pub place: Option<Place>,
+    /// Strength of all effects together, where they hide one another.
+    #[serde(default)]
+    pub combined_strength: Option<f64>,
     /// Of the added noise.
     #[serde(default)]
     pub noise_rms: Option<f64>,
@@ -213,6 +216,12 @@ pub struct Truth {
 }
 
 impl Truth {
+    /// Strength of what is hidden: of the weakest effect, or of all together if that is less.
+    pub fn strength(&self, weakest: f64) -> f64 {
+        self.combined_strength
+            .map_or(weakest, |together| weakest.min(together))
+    }
+
     /// Nobody knows what is right here: only errors are scored.
     pub fn unknown(&self) -> bool {
         self.standing.as_deref() == Some("none")

@@ -142,6 +142,15 @@ const COMBINED: [&[&str]; 10] = [
     &["supply-ratiometric", "offset-temperature", "delay"],
 ];
 
+/// The same of batteries.
+const COMBINED_BATTERY: [&[&str]; 5] = [
+    &["polarisation", "ocv-hysteresis"],
+    &["diffusion", "resistance-temperature"],
+    &["capacity", "resistance-soc"],
+    &["entropic", "resistance-temperature"],
+    &["polarisation", "resistance-soc", "entropic"],
+];
+
 /// What people use today, by the names of proof/methods/run.py.
 const METHODS: [&str; 7] = [
     "straight-line",
@@ -513,6 +522,24 @@ fn combined() -> Vec<Planned> {
             );
         }
     }
+    for effects in COMBINED_BATTERY {
+        for drive in CELL_DRIVES {
+            plan.push(
+                New {
+                    group: Group::Combined,
+                    maker: "battery",
+                    effects,
+                    strength: 10.0,
+                    noise: "white",
+                    drive,
+                    seed: 1,
+                    rows: BATTERY_ROWS,
+                    options: options(json!({ "masked": true })),
+                }
+                .planned(),
+            );
+        }
+    }
     plan
 }
 
@@ -627,6 +654,22 @@ fn inseparable() -> Vec<Planned> {
                 .planned(),
             );
         }
+    }
+    for drive in CELL_DRIVES {
+        plan.push(
+            New {
+                group: Group::Inseparable,
+                maker: "battery",
+                effects: &["offset"],
+                strength: 10.0,
+                noise: "white",
+                drive,
+                seed: 1,
+                rows: BATTERY_ROWS,
+                options: Map::new(),
+            }
+            .planned(),
+        );
     }
     for effect in ["gain", "core-saturation"] {
         plan.push(

@@ -83,7 +83,7 @@ impl Record {
         let truth = self.truth.as_ref()?;
         Some(score::judge(
             truth,
-            self.planned.case.strength(),
+            truth.strength(self.planned.case.strength()),
             &[],
             self.said.as_ref(),
         ))
@@ -102,7 +102,7 @@ impl Record {
         }
         Some(score::judge(
             &left,
-            self.planned.case.strength(),
+            truth.strength(self.planned.case.strength()),
             &self.removed,
             self.without.as_ref(),
         ))

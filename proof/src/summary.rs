@@ -305,8 +305,12 @@ impl Scored<'_> {
         !self.truth.required.is_empty()
     }
 
+    fn strength(&self) -> f64 {
+        self.truth.strength(self.record.planned.case.strength())
+    }
+
     fn plain(&self) -> bool {
-        self.record.planned.case.strength() >= PLAIN
+        self.strength() >= PLAIN
     }
 }
 
@@ -776,12 +780,7 @@ fn methods_on(scored: &[Scored<'_>], data: &str, kinds: &[&str]) -> Vec<MethodLi
             }
             cases.push(Compared {
                 scored: one,
-                judged: score::judge(
-                    one.truth,
-                    one.record.planned.case.strength(),
-                    &[],
-                    Some(&as_said(found)),
-                ),
+                judged: score::judge(one.truth, one.strength(), &[], Some(&as_said(found))),
                 names: !found.named.is_empty(),
                 held_out: found.held_out_rms,
                 seconds: found.seconds,
@@ -880,12 +879,7 @@ fn speed(scored: &[Scored<'_>]) -> Option<(f64, usize)> {
                     .is_some_and(|theirs| theirs <= AS_WELL * ours.after)
             })
             .filter(|found| {
-                let judged = score::judge(
-                    one.truth,
-                    one.record.planned.case.strength(),
-                    &[],
-                    Some(&as_said(found)),
-                );
+                let judged = score::judge(one.truth, one.strength(), &[], Some(&as_said(found)));
                 judged.outcome.right()
             })
             .filter_map(|found| found.seconds)
