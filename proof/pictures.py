@@ -29,15 +29,15 @@ OUTCOMES = [
 ]
 
 plt.rcParams.update({
-    "font.size": 9, "font.family": "DejaVu Sans", "svg.fonttype": "path", "svg.hashsalt": "hallmark", "axes.spines.top": False,
-    "axes.spines.right": False, "axes.edgecolor": INK, "axes.titlesize": 10, "axes.titlelocation": "left", "figure.dpi": 100,
+    "font.size": 9, "font.family": "DejaVu Sans", "axes.spines.top": False,
+    "axes.spines.right": False, "axes.edgecolor": INK, "axes.titlesize": 10, "axes.titlelocation": "left", "savefig.dpi": 110,
     "savefig.bbox": "tight", "figure.facecolor": "white",
 })
 
 
 def save(figure, folder: pathlib.Path, name: str) -> None:
-    """Writes an SVG that is the same whenever it is made."""
-    figure.savefig(folder / name, metadata={"Date": None, "Creator": None})
+    """Writes a picture that is the same whenever it is made."""
+    figure.savefig(folder / name, metadata={"Software": None})
     plt.close(figure)
 
 
@@ -78,7 +78,7 @@ def real(data: dict, folder: pathlib.Path) -> None:
     axes.set_xlabel("held-out error over that of the model as designed (dotted); beyond 20 at the edge")
     axes.set_title("Real recordings: error on what was never fitted")
     axes.legend(loc="upper center", bbox_to_anchor=(0.4, -0.14 - 0.35 / len(lines)), ncols=4, frameon=False)
-    save(figure, folder, "real.svg")
+    save(figure, folder, "real.png")
 
 
 def bars(axes, lines: list[dict]) -> None:
@@ -112,7 +112,7 @@ def others(data: dict, folder: pathlib.Path) -> None:
     bars(axes, lines)
     axes.set_yticks(range(len(lines)), [KINDS[line["name"]] for line in lines])
     axes.set_title("What twin said, by who made the data (all strengths)")
-    save(figure, folder, "others.svg")
+    save(figure, folder, "others.png")
 
 
 def false_alarms(data: dict, folder: pathlib.Path) -> None:
@@ -134,7 +134,7 @@ def false_alarms(data: dict, folder: pathlib.Path) -> None:
     axes.invert_yaxis()
     axes.set_xlabel("% of clean recordings in which an effect is named, with 95 % interval (dashed: 5 %)")
     axes.set_title("Nothing concealed, and yet something named")
-    save(figure, folder, "false-alarms.svg")
+    save(figure, folder, "false-alarms.png")
 
 
 def methods(data: dict, folder: pathlib.Path) -> None:
@@ -160,7 +160,7 @@ def methods(data: dict, folder: pathlib.Path) -> None:
     all_axes[0][0].set_ylabel("right name or class, %")
     handles = {label: handle for axes in all_axes[0] for handle, label in zip(*axes.get_legend_handles_labels())}
     figure.legend(handles.values(), handles.keys(), loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=4, frameon=False)
-    save(figure, folder, "methods.svg")
+    save(figure, folder, "methods.png")
 
 
 def detection(data: dict, folder: pathlib.Path) -> None:
@@ -186,7 +186,7 @@ def detection(data: dict, folder: pathlib.Path) -> None:
     axes.set_xlabel("strength (1: just visible; the reading moves by 0.3 of the noise)")
     axes.set_title("Right name or class, %")
     figure.colorbar(image, ax=axes, pad=0.02, aspect=40)
-    save(figure, folder, "detection.svg")
+    save(figure, folder, "detection.png")
 
 
 def coverage(data: dict, folder: pathlib.Path) -> None:
@@ -206,7 +206,7 @@ def coverage(data: dict, folder: pathlib.Path) -> None:
     axes.invert_yaxis()
     axes.set_xlabel("% of the 95 % intervals that have the truth in them (band: 90 … 98 %)")
     axes.set_title("Are the intervals worth their name?")
-    save(figure, folder, "coverage.svg")
+    save(figure, folder, "coverage.png")
 
 
 def board(data: dict, folder: pathlib.Path) -> None:
@@ -227,7 +227,7 @@ def board(data: dict, folder: pathlib.Path) -> None:
     axes.set_xlabel("rms error of the current on a drive that was never fitted, A")
     axes.set_title("Emulated board, unmodified image")
     axes.legend(frameon=False, loc="lower right")
-    save(figure, folder, "board.svg")
+    save(figure, folder, "board.png")
 
 
 def main() -> None:
@@ -238,7 +238,7 @@ def main() -> None:
     arguments = parser.parse_args()
     data = json.loads(arguments.results.read_text(encoding="utf-8"))
     for name in ("real", "others", "false-alarms", "methods", "detection", "coverage", "board"):
-        (arguments.folder / f"{name}.svg").unlink(missing_ok=True)
+        (arguments.folder / f"{name}.png").unlink(missing_ok=True)
     for draw in (real, others, false_alarms, methods, detection, coverage, board):
         draw(data, arguments.folder)
 
