@@ -30,7 +30,7 @@ OUTCOMES = [
 
 plt.rcParams.update({
     "font.size": 9, "font.family": "DejaVu Sans", "axes.spines.top": False,
-    "axes.spines.right": False, "axes.edgecolor": INK, "axes.titlesize": 10, "axes.titlelocation": "left", "savefig.dpi": 110,
+    "axes.spines.right": False, "axes.edgecolor": INK, "axes.titlesize": 10, "axes.titlelocation": "left", "savefig.dpi": 90,
     "savefig.bbox": "tight", "figure.facecolor": "white",
 })
 
@@ -210,23 +210,23 @@ def coverage(data: dict, folder: pathlib.Path) -> None:
 
 
 def board(data: dict, folder: pathlib.Path) -> None:
-    """Error of the board's current before and after the calibration."""
+    """Errors of the board before and after the calibration."""
     lines = [line for line in data["board"] if line["calibrated"]]
     if not lines:
         return
-    figure, axes = plt.subplots(figsize=(6.4, 0.5 * len(lines) + 1.0))
-    for place, line in enumerate(lines):
-        before, after = line["calibrated"]["before_a"], line["calibrated"]["after_a"]
-        axes.barh(place - 0.18, before, 0.34, color=ORANGE, label="as it left the factory" if place == 0 else None)
-        axes.barh(place + 0.18, after, 0.34, color=BLUE, label="calibration of twin written back" if place == 0 else None)
-        for at, error in ((-0.18, before), (0.18, after)):
-            axes.text(error, place + at, f" {error:.3g} A", va="center", fontsize=8)
-    axes.set_yticks(range(len(lines)), [line["concealed"] for line in lines])
-    axes.invert_yaxis()
-    axes.margins(x=0.15)
-    axes.set_xlabel("rms error of the current on a drive that was never fitted, A")
-    axes.set_title("Emulated board, unmodified image")
-    axes.legend(frameon=False, loc="lower right")
+    figure, panels = plt.subplots(1, 2, figsize=(7.6, 0.5 * len(lines) + 1.2), sharey=True)
+    for axes, what, unit, title in ((panels[0], "", "a", "current, rms, A"), (panels[1], "charge_", "c", "charge at the end, C")):
+        for place, line in enumerate(lines):
+            for at, when, colour, label in ((-0.18, "before", ORANGE, "as it left the factory"),
+                                            (0.18, "after", BLUE, "calibration of twin written back")):
+                error = abs(line["calibrated"][f"{what}{when}_{unit}"])
+                axes.barh(place + at, error, 0.34, color=colour, label=label if place == 0 else None)
+                axes.text(error, place + at, f" {error:.3g}", va="center", fontsize=8)
+        axes.margins(x=0.2)
+        axes.set_title(title)
+    panels[0].set_yticks(range(len(lines)), [line["concealed"] for line in lines])
+    panels[0].invert_yaxis()
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False)
     save(figure, folder, "board.png")
 
 
