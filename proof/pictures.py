@@ -29,15 +29,15 @@ OUTCOMES = [
 ]
 
 plt.rcParams.update({
-    "font.size": 9, "font.family": "DejaVu Sans", "svg.fonttype": "path", "svg.hashsalt": "hallmark", "axes.spines.top": False,
-    "axes.spines.right": False, "axes.edgecolor": INK, "axes.titlesize": 10, "axes.titlelocation": "left", "figure.dpi": 100,
+    "font.size": 9, "font.family": "DejaVu Sans", "axes.spines.top": False,
+    "axes.spines.right": False, "axes.edgecolor": INK, "axes.titlesize": 10, "axes.titlelocation": "left", "savefig.dpi": 90,
     "savefig.bbox": "tight", "figure.facecolor": "white",
 })
 
 
 def save(figure, folder: pathlib.Path, name: str) -> None:
-    """Writes an SVG that is the same whenever it is made."""
-    figure.savefig(folder / name, metadata={"Date": None, "Creator": None})
+    """Writes a picture that is the same whenever it is made."""
+    figure.savefig(folder / name, metadata={"Software": None})
     plt.close(figure)
 
 
@@ -78,7 +78,7 @@ def real(data: dict, folder: pathlib.Path) -> None:
     axes.set_xlabel("held-out error over that of the model as designed (dotted); beyond 20 at the edge")
     axes.set_title("Real recordings: error on what was never fitted")
     axes.legend(loc="upper center", bbox_to_anchor=(0.4, -0.14 - 0.35 / len(lines)), ncols=4, frameon=False)
-    save(figure, folder, "real.svg")
+    save(figure, folder, "real.png")
 
 
 def bars(axes, lines: list[dict]) -> None:
@@ -112,7 +112,7 @@ def others(data: dict, folder: pathlib.Path) -> None:
     bars(axes, lines)
     axes.set_yticks(range(len(lines)), [KINDS[line["name"]] for line in lines])
     axes.set_title("What twin said, by who made the data (all strengths)")
-    save(figure, folder, "others.svg")
+    save(figure, folder, "others.png")
 
 
 def false_alarms(data: dict, folder: pathlib.Path) -> None:
@@ -134,7 +134,7 @@ def false_alarms(data: dict, folder: pathlib.Path) -> None:
     axes.invert_yaxis()
     axes.set_xlabel("% of clean recordings in which an effect is named, with 95 % interval (dashed: 5 %)")
     axes.set_title("Nothing concealed, and yet something named")
-    save(figure, folder, "false-alarms.svg")
+    save(figure, folder, "false-alarms.png")
 
 
 def methods(data: dict, folder: pathlib.Path) -> None:
@@ -160,7 +160,7 @@ def methods(data: dict, folder: pathlib.Path) -> None:
     all_axes[0][0].set_ylabel("right name or class, %")
     handles = {label: handle for axes in all_axes[0] for handle, label in zip(*axes.get_legend_handles_labels())}
     figure.legend(handles.values(), handles.keys(), loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=4, frameon=False)
-    save(figure, folder, "methods.svg")
+    save(figure, folder, "methods.png")
 
 
 def detection(data: dict, folder: pathlib.Path) -> None:
@@ -186,7 +186,7 @@ def detection(data: dict, folder: pathlib.Path) -> None:
     axes.set_xlabel("strength (1: just visible; the reading moves by 0.3 of the noise)")
     axes.set_title("Right name or class, %")
     figure.colorbar(image, ax=axes, pad=0.02, aspect=40)
-    save(figure, folder, "detection.svg")
+    save(figure, folder, "detection.png")
 
 
 def coverage(data: dict, folder: pathlib.Path) -> None:
@@ -206,28 +206,28 @@ def coverage(data: dict, folder: pathlib.Path) -> None:
     axes.invert_yaxis()
     axes.set_xlabel("% of the 95 % intervals that have the truth in them (band: 90 … 98 %)")
     axes.set_title("Are the intervals worth their name?")
-    save(figure, folder, "coverage.svg")
+    save(figure, folder, "coverage.png")
 
 
 def board(data: dict, folder: pathlib.Path) -> None:
-    """Error of the board's current before and after the calibration."""
+    """Errors of the board before and after the calibration."""
     lines = [line for line in data["board"] if line["calibrated"]]
     if not lines:
         return
-    figure, axes = plt.subplots(figsize=(6.4, 0.5 * len(lines) + 1.0))
-    for place, line in enumerate(lines):
-        before, after = line["calibrated"]["before_a"], line["calibrated"]["after_a"]
-        axes.barh(place - 0.18, before, 0.34, color=ORANGE, label="as it left the factory" if place == 0 else None)
-        axes.barh(place + 0.18, after, 0.34, color=BLUE, label="calibration of twin written back" if place == 0 else None)
-        for at, error in ((-0.18, before), (0.18, after)):
-            axes.text(error, place + at, f" {error:.3g} A", va="center", fontsize=8)
-    axes.set_yticks(range(len(lines)), [line["concealed"] for line in lines])
-    axes.invert_yaxis()
-    axes.margins(x=0.15)
-    axes.set_xlabel("rms error of the current on a drive that was never fitted, A")
-    axes.set_title("Emulated board, unmodified image")
-    axes.legend(frameon=False, loc="lower right")
-    save(figure, folder, "board.svg")
+    figure, panels = plt.subplots(1, 2, figsize=(7.6, 0.5 * len(lines) + 1.2), sharey=True)
+    for axes, what, unit, title in ((panels[0], "", "a", "current, rms, A"), (panels[1], "charge_", "c", "charge at the end, C")):
+        for place, line in enumerate(lines):
+            for at, when, colour, label in ((-0.18, "before", ORANGE, "as it left the factory"),
+                                            (0.18, "after", BLUE, "calibration of twin written back")):
+                error = abs(line["calibrated"][f"{what}{when}_{unit}"])
+                axes.barh(place + at, error, 0.34, color=colour, label=label if place == 0 else None)
+                axes.text(error, place + at, f" {error:.3g}", va="center", fontsize=8)
+        axes.margins(x=0.2)
+        axes.set_title(title)
+    panels[0].set_yticks(range(len(lines)), [line["concealed"] for line in lines])
+    panels[0].invert_yaxis()
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False)
+    save(figure, folder, "board.png")
 
 
 def main() -> None:
@@ -238,7 +238,7 @@ def main() -> None:
     arguments = parser.parse_args()
     data = json.loads(arguments.results.read_text(encoding="utf-8"))
     for name in ("real", "others", "false-alarms", "methods", "detection", "coverage", "board"):
-        (arguments.folder / f"{name}.svg").unlink(missing_ok=True)
+        (arguments.folder / f"{name}.png").unlink(missing_ok=True)
     for draw in (real, others, false_alarms, methods, detection, coverage, board):
         draw(data, arguments.folder)
 

@@ -210,7 +210,7 @@ fn index(summary: &Summary, folder: &Path) -> String {
     picture(
         &mut text,
         folder,
-        "real.svg",
+        "real.png",
         "Held-out error on each real recording: as designed, twin, today's methods",
     );
     real_table(&mut text, &summary.real);
@@ -225,7 +225,7 @@ fn index(summary: &Summary, folder: &Path) -> String {
         picture(
             &mut text,
             folder,
-            "others.svg",
+            "others.png",
             "What was hidden in the data of other people's simulators, and what was said",
         );
         counts_table(&mut text, &others, "made by", with_kinds);
@@ -236,7 +236,7 @@ fn index(summary: &Summary, folder: &Path) -> String {
     picture(
         &mut text,
         folder,
-        "false-alarms.svg",
+        "false-alarms.png",
         "Share of clean recordings in which something is named, by twin and by today's methods",
     );
     text.push_str(
@@ -259,7 +259,7 @@ fn index(summary: &Summary, folder: &Path) -> String {
         picture(
             &mut text,
             folder,
-            "methods.svg",
+            "methods.png",
             "Right names and time, twin and today's methods",
         );
         methods_table(&mut text, summary);
@@ -269,7 +269,7 @@ fn index(summary: &Summary, folder: &Path) -> String {
     picture(
         &mut text,
         folder,
-        "detection.svg",
+        "detection.png",
         "Share of right answers of each effect over its strength",
     );
     for (kind, (cases, median, most, within)) in &summary.over_oracle {
@@ -285,7 +285,7 @@ fn index(summary: &Summary, folder: &Path) -> String {
     picture(
         &mut text,
         folder,
-        "coverage.svg",
+        "coverage.png",
         "Share of 95 % intervals that have the truth in them, by effect",
     );
     for (kind, (cases, low, middle, high)) in &summary.overlap {
@@ -307,7 +307,7 @@ fn index(summary: &Summary, folder: &Path) -> String {
     picture(
         &mut text,
         folder,
-        "board.svg",
+        "board.png",
         "Error of the board's current before and after the calibration",
     );
     board_table(&mut text, summary);

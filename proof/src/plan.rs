@@ -244,8 +244,13 @@ fn options(value: Value) -> Map<String, Value> {
     }
 }
 
-fn all_methods() -> Vec<String> {
-    METHODS.iter().map(|name| (*name).to_owned()).collect()
+/// PyBOP knows nothing but cells.
+fn all_methods(battery: bool) -> Vec<String> {
+    METHODS
+        .iter()
+        .filter(|name| battery || **name != "pybop")
+        .map(|name| (*name).to_owned())
+        .collect()
 }
 
 /// Every case of the full campaign, in the order in which it runs: the long ones first.
@@ -270,7 +275,7 @@ fn full(real: &[Expected]) -> Vec<Planned> {
             methods: if one.two_clocks() {
                 Vec::new()
             } else {
-                all_methods()
+                all_methods(one.battery)
             },
         });
     }
@@ -313,7 +318,7 @@ fn others() -> Vec<Planned> {
         ] {
             let mut planned = circuit(Group::Circuits, &[effect], strength, noise, drive, 1);
             if (strength, noise, drive) == (10.0, "white", "us06") {
-                planned.methods = all_methods();
+                planned.methods = all_methods(false);
             }
             plan.push(planned);
         }
@@ -323,7 +328,7 @@ fn others() -> Vec<Planned> {
             for seed in 1..=8 {
                 let mut planned = circuit(Group::Clean, &[], f64::INFINITY, noise, drive, seed);
                 if seed == 1 {
-                    planned.methods = all_methods();
+                    planned.methods = all_methods(false);
                 }
                 plan.push(planned);
             }
@@ -357,7 +362,7 @@ fn cells() -> Vec<Planned> {
     for model in ["spme", "dfn"] {
         for drive in CELL_DRIVES {
             let mut warm = cell(&["diffusion"], 10.0, drive, json!({ "model": model }));
-            warm.methods = all_methods();
+            warm.methods = all_methods(true);
             plan.push(warm);
             for temperature_c in [0, 10, 40] {
                 plan.push(cell(
@@ -490,7 +495,7 @@ fn single(
     let usual = strength == 10.0 && noise == "white";
     planned.without = usual && place < 2;
     if usual && place == 0 {
-        planned.methods = all_methods();
+        planned.methods = all_methods(maker == "battery");
     }
     planned.twice = usual && place == 0 && effect == "lag";
     planned
@@ -561,7 +566,7 @@ fn clean() -> Vec<Planned> {
                 }
                 .planned();
                 if seed == 1 {
-                    planned.methods = all_methods();
+                    planned.methods = all_methods(false);
                 }
                 plan.push(planned);
             }

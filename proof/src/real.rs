@@ -61,6 +61,9 @@ pub struct Expected {
     /// What the publisher measured.
     #[serde(default)]
     pub parameter: Vec<Published>,
+    /// The model is of a battery.
+    #[serde(skip)]
+    pub battery: bool,
 }
 
 #[derive(Deserialize)]
@@ -71,9 +74,20 @@ struct Entries {
 /// Reads expected.toml.
 pub fn expected(path: &Path) -> Result<Vec<Expected>> {
     let text = fs::read_to_string(path).with_context(|| format!("reading {}", path.display()))?;
-    let entries: Entries =
+    let mut entries: Entries =
         toml::from_str(&text).with_context(|| format!("reading {}", path.display()))?;
-    for one in &entries.case {
+    // proof/expected.toml: models are told from the checkout's top folder.
+    let root = path
+        .parent()
+        .and_then(Path::parent)
+        .unwrap_or(Path::new("."));
+    for one in &mut entries.case {
+        if let Some(model) = &one.model {
+            let model = root.join(model);
+            let stated = fs::read_to_string(&model)
+                .with_context(|| format!("reading {}", model.display()))?;
+            one.battery = stated.lines().any(|line| line.trim() == "[battery]");
+        }
         if !["published", "beside", "none"].contains(&one.truth.as_str()) {
             bail!(
                 "{}: {}: truth: found {:?}, expected published, beside or none",
