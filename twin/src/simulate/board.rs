@@ -393,8 +393,8 @@ impl Board {
     }
 }
 
-/// Share of a step between rows by which a row may seem to come before its conversion.
-const EARLY: f64 = 0.25;
+/// Share of a step between rows by which the few may be earlier still.
+const EARLY: f64 = 0.05;
 
 /// When the conversions ended that valid rows saw for the first time: on a grid of their own if the changes of the
 /// reading fit one, else at the rows.
@@ -412,11 +412,25 @@ fn ends(observed: &Observed, rows: std::ops::Range<usize>, period_s: f64) -> Vec
         .map(|pair| observed.t_s[pair[1]])
         .collect();
     match grid(&changes, period_s, step_s) {
-        // The grid is known to a part of a step only. A row can come much later, where a value was the same again, and never
-        // before its conversion.
-        Some((grid_s, start_s)) => times()
-            .map(|t| start_s + ((t - start_s + EARLY * step_s) / grid_s).floor() * grid_s)
-            .collect(),
+        Some((grid_s, start_s)) => {
+            // The grid is known to a part of a step only, and no change comes before its conversion: but for the few that a range
+            // change makes. A row can come much later, where a value was the same again.
+            let mut late_s: Vec<f64> = changes
+                .iter()
+                .map(|t| (t - start_s) / grid_s)
+                .map(|late| (late - late.round()) * grid_s)
+                .collect();
+            let few = late_s.len() / 200;
+            let first_s = *late_s.select_nth_unstable_by(few, f64::total_cmp).1;
+            let early_s = if first_s < 0.0 {
+                (EARLY * step_s - first_s).min(0.5 * step_s)
+            } else {
+                0.0
+            };
+            times()
+                .map(|t| start_s + ((t - start_s + early_s) / grid_s + 1e-6).floor() * grid_s)
+                .collect()
+        }
         None => times().collect(),
     }
 }
