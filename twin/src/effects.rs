@@ -182,8 +182,8 @@ pub struct Card {
     pub stage: Stage,
 }
 
-/// A first-order filter, a linear drift or a branch of resistance and capacitance describes a real part to some percent.
-const IDEALISED: f64 = 0.03;
+/// A first-order filter, a linear drift or a branch of resistance and capacitance describes a real part to five percent.
+const IDEALISED: f64 = 0.05;
 
 /// An effect of the library.
 pub trait Effect: Sync {

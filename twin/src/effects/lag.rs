@@ -24,10 +24,7 @@ impl Effect for Lag {
     }
 
     fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
-        (
-            0.02 * scale.step_s.min(scale.reading_step_s),
-            0.5 * scale.span_s,
-        )
+        (scale.fastest_s, 0.5 * scale.span_s)
     }
 
     fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {

@@ -24,10 +24,8 @@ impl Effect for MovingAverage {
     }
 
     fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
-        (
-            0.05 * scale.step_s.min(scale.reading_step_s),
-            0.5 * scale.span_s,
-        )
+        // A window is late by half of itself.
+        (2.0 * scale.fastest_s, 0.5 * scale.span_s)
     }
 
     fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {

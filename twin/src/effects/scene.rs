@@ -25,6 +25,8 @@ pub struct Scale {
     pub full_scale: f64,
     /// Root mean square of what is to be explained.
     pub mismatch: f64,
+    /// Fastest time constant that the readings can tell, in s.
+    pub fastest_s: f64,
     /// Median step of the drive in s.
     pub step_s: f64,
     /// Median step of the readings that count, in s.

@@ -11,7 +11,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 use crate::effects::chain::{Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
 use crate::effects::{Clues, Effect, LIBRARY, Stage};
-use crate::problem::{Base, Problem};
+use crate::problem::{Base, Problem, View};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row).
 const MOST_ROWS: usize = 250_000;
@@ -373,9 +373,15 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         mismatch: rms(y.iter().zip(plain).map(|(y, p)| y - p)),
         step_s: drive.median_step_s(),
         reading_step_s,
+        fastest_s: 0.02 * drive.median_step_s().min(reading_step_s),
         span_s,
         ..Scale::default()
     };
+    if problem.view == View::Charge {
+        // A counter's differences tell nothing that is faster than themselves, however fast the current was recorded.
+        scale.step_s = scale.step_s.max(reading_step_s);
+        scale.fastest_s = 0.1 * reading_step_s;
+    }
     match &problem.base {
         Base::Sensor(base) => {
             scale.full_scale = base.full_scale.unwrap_or(scale.full_scale);
