@@ -8,8 +8,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("cargo:rustc-link-search={}", out.display());
     println!("cargo:rerun-if-changed=../memory.x");
     println!("cargo:rerun-if-changed=build.rs");
-    // `--nmagic`: sections need no page alignment in a flash image.
-    for argument in ["--nmagic", "-Tlink.x", "-Tdefmt.x"] {
+    // `--nmagic`: sections need no page alignment in a flash image. `--icf=all`: equal functions are one; nothing here tells
+    // functions apart by their addresses.
+    for argument in ["--nmagic", "--icf=all", "-Tlink.x", "-Tdefmt.x"] {
         println!("cargo:rustc-link-arg-bins={argument}");
     }
     // The revision goes into the identity frames; a source without git has none.

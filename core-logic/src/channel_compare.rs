@@ -54,7 +54,8 @@ impl CompareConfig {
     #[must_use]
     pub const fn frozen_current(&self, range: Range, count: Nanocoulombs) -> Microamps {
         // nC in 1 s are nA.
-        let counts = crate::units::div_round(count.get().saturating_mul(2 * FROZEN_COUNTS), 1_000);
+        let counts =
+            crate::units::div_round(crate::units::mul_i64(count.get(), 2 * FROZEN_COUNTS), 1_000);
         let doubt = 2 * self.zero_tolerance.get(range).get() as i64;
         Microamps(crate::units::clamp_i32(crate::units::mul_div(
             doubt.saturating_add(counts),

@@ -25,7 +25,8 @@ use crate::design_parameters as design;
 use crate::front_end::{Channel, FrontEnd, KeyFactors, PerRange};
 use crate::range::Range;
 use crate::units::{
-    Duration, Instant, Microamps, Microvolts, Ppm, clamp_i32, div_round, elapsed, mul_div,
+    Duration, Instant, Microamps, Microvolts, Ppm, clamp_i32_inline, div_round, elapsed, mul_div,
+    mul_i64,
 };
 use crate::validity::Validity;
 
@@ -416,7 +417,7 @@ impl ConverterCoefficients {
 
 /// `slope · input + offset`, rounded to nearest with halves upward. No overflow by [`TERM_LIMIT`].
 const fn evaluate(slope: i64, offset: i64, input: i32) -> i32 {
-    clamp_i32((slope * input as i64 + offset + (1 << (FRACTION_BITS - 1))) >> FRACTION_BITS)
+    clamp_i32_inline((slope * input as i64 + offset + (1 << (FRACTION_BITS - 1))) >> FRACTION_BITS)
 }
 
 /// `value · multiplier / divisor`, rounded to nearest, for a positive divisor: [`mul_div`] with 64-bit divisions alone
@@ -491,9 +492,9 @@ fn fold(
     };
 
     let unit = 1_i64 << FOLDING_BITS;
-    let above_zero = with_k((micro(key.a) * 1_000).saturating_mul(unit))
-        .saturating_sub(line.zero_nanovolts.saturating_mul(unit));
-    let zero_drift = i64::from(corrections.zero_drift.of(range).get()).saturating_mul(unit);
+    let above_zero = with_k(mul_i64(micro(key.a) * 1_000, unit))
+        .saturating_sub(mul_i64(line.zero_nanovolts, unit));
+    let zero_drift = mul_i64(i64::from(corrections.zero_drift.of(range).get()), unit);
     let slope = folded(to_microamps(with_k(step)), input_bits);
     let limits = front_end.output_limits_at(range, supply);
     RangeCoefficients {

@@ -26,7 +26,7 @@ use crate::front_end::{Channel, FrontEnd, KeyFactors, PerRange, SupplyRelations}
 use crate::key_calibration::{
     KeyCalibration, KeyInputs, KeyOutputs, KeyPhase, KeyRefusal, KeySample, KeyState,
 };
-use crate::meter::{GapBridge, MeterConfig, MeterReport};
+use crate::meter::{GapBridge, MeterCalibration, MeterConfig, MeterReport};
 use crate::modbus::readings::CommandState;
 use crate::modbus::{Activity, Readings};
 use crate::open_sensor::{Finding, OpenSensor, OpenSensorThresholds};
@@ -259,7 +259,7 @@ pub struct Measurement {
     meter: MeterReport,
     meter_causes: Validity,
     /// [`Measurement::meter_config`] is another one since it was taken.
-    meter_config_changed: bool,
+    meter_calibration_changed: bool,
     zero: ZeroCalibration,
     zero_beyond_limit: bool,
     sweep: Option<SupplyCalibration>,
@@ -458,7 +458,7 @@ impl Measurement {
             compare: ChannelCompare::new(),
             meter: MeterReport::default(),
             meter_causes: Validity::STALE,
-            meter_config_changed: true,
+            meter_calibration_changed: true,
             zero: ZeroCalibration::new(),
             zero_beyond_limit: false,
             sweep: None,
@@ -510,8 +510,12 @@ impl Measurement {
     }
 
     /// What the meter's owner has to count with, if that has changed since the last call.
-    pub fn changed_meter_config(&mut self, configuration: &Configuration) -> Option<MeterConfig> {
-        core::mem::take(&mut self.meter_config_changed).then(|| self.meter_config(configuration))
+    pub fn changed_meter_calibration(
+        &mut self,
+        configuration: &Configuration,
+    ) -> Option<MeterCalibration> {
+        core::mem::take(&mut self.meter_calibration_changed)
+            .then(|| MeterCalibration::new(self.meter_config(configuration)))
     }
 
     fn prepare_again(
@@ -522,7 +526,7 @@ impl Measurement {
         now: Instant,
     ) {
         self.prepared = prepare(configuration, factors, supply);
-        self.meter_config_changed = true;
+        self.meter_calibration_changed = true;
         self.converter.forget_meter_until(meter_follows(now));
     }
 

@@ -348,6 +348,7 @@ impl Accumulator {
     }
 
     /// To the nearest nC.
+    #[inline(never)]
     const fn rounded(&self) -> Nanocoulombs {
         Nanocoulombs(
             self.whole
@@ -399,6 +400,26 @@ impl Coefficients {
         let small_per_large = div_round_i128(small << 32, large);
         let weight = (1 << 32) - share_large + (mul_i128(share_large, small_per_large) >> 32);
         clamp_i64(div_round_i128(small << 32, weight))
+    }
+}
+
+/// A configuration with the factors that follow from it. Working them out takes 128-bit divisions: to be done where nobody
+/// waits, so that [`MeterChannel::set_calibration`] only has to copy.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct MeterCalibration {
+    config: MeterConfig,
+    coefficients: Coefficients,
+}
+
+impl MeterCalibration {
+    /// Works the factors out.
+    #[must_use]
+    pub fn new(config: MeterConfig) -> Self {
+        Self {
+            config,
+            coefficients: Coefficients::new(&config),
+        }
     }
 }
 
@@ -481,9 +502,18 @@ impl MeterChannel {
     }
 
     /// Another calibration: counts after the last reading are taken by it. Charge and remainder stay as they are.
-    pub fn set_config(&mut self, config: MeterConfig) {
-        self.coefficients = Coefficients::new(&config);
+    pub fn set_calibration(&mut self, calibration: MeterCalibration) {
+        let MeterCalibration {
+            config,
+            coefficients,
+        } = calibration;
         self.config = config;
+        self.coefficients = coefficients;
+    }
+
+    /// As [`MeterChannel::set_calibration`], with the factors worked out here.
+    pub fn set_config(&mut self, config: MeterConfig) {
+        self.set_calibration(MeterCalibration::new(config));
     }
 
     /// The configuration in use.

@@ -186,7 +186,7 @@ fn divide(sum: i64, count: u8) -> i32 {
     let rest = ((high % count) << 16) + low;
     let quotient = (i64::from(high / count) << 16) + i64::from(rest / count);
     let rounded = quotient + i64::from(2 * (rest % count) >= count);
-    crate::units::clamp_i32(if sum < 0 { -rounded } else { rounded })
+    crate::units::clamp_i32_inline(if sum < 0 { -rounded } else { rounded })
 }
 
 #[cfg(test)]

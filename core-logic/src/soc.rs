@@ -33,8 +33,8 @@ use crate::design_parameters::{
 };
 use crate::ocv::OcvTable;
 use crate::units::{
-    Duration, Instant, Microamps, Microvolts, Nanocoulombs, Ppm, clamp_i32, clamp_i64, div_i128,
-    div_round, elapsed, milliseconds, mul_div, mul_wide,
+    Duration, Instant, Microamps, Microvolts, Nanocoulombs, Ppm, clamp_i32, clamp_i32_inline,
+    clamp_i64, div_i128, div_round, elapsed, milliseconds, mul_div, mul_wide,
 };
 
 /// Charging excursions up to this bear no efficiency loss: 150 counts of the small range, 15 of the large one, and a
@@ -194,7 +194,7 @@ impl SocCoefficients {
         let inside = charge.get().clamp(0, self.capacity);
         // At most 10⁶ · 2⁴², which fits.
         let product = (inside >> self.shift) * self.reciprocal;
-        Ppm(clamp_i32(
+        Ppm(clamp_i32_inline(
             (product + (1 << (RECIPROCAL_PLACES - 1))) >> RECIPROCAL_PLACES,
         ))
     }

@@ -18,8 +18,8 @@ use crate::design_parameters::{
 };
 use crate::front_end::{SupplyRelations, TURNS_LIMITS};
 use crate::units::{
-    Microamps, Microvolts, clamp_i32, clamp_i64, div_i128, div_round_i128, mul_i128, mul_wide,
-    sub_i128,
+    Microamps, Microvolts, clamp_i32, clamp_i64, div_i128, div_round_i128, mul_i64, mul_i128,
+    mul_wide, sub_i128,
 };
 
 /// Points that one run takes.
@@ -291,7 +291,7 @@ fn check(
     }
     let (least, most) = SENSITIVITY_LIMITS_NANOVOLT_PER_AMP;
     let turns = i64::from(turns);
-    let allowed = least.saturating_mul(turns)..=most.saturating_mul(turns);
+    let allowed = mul_i64(least, turns)..=mul_i64(most, turns);
     // A straight line: what holds at both ends holds between them.
     let both = [SENSOR_SUPPLY_LOW, SENSOR_SUPPLY_HIGH];
     if both

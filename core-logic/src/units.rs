@@ -11,8 +11,9 @@ pub type Instant = fugit::MonotonicTimerInstantU64<1_000_000>;
 /// A length of time in microseconds.
 pub type Duration = fugit::MicrosDurationU64;
 
-/// `later - earlier`, or zero when the two are in the wrong order.
+/// `later - earlier`, or zero when the two are in the wrong order. Not inlined: see below.
 #[must_use]
+#[inline(never)]
 pub fn elapsed(earlier: Instant, later: Instant) -> Duration {
     later
         .checked_duration_since(earlier)
@@ -286,6 +287,13 @@ pub const fn mul_wide(a: i64, b: i64) -> i128 {
 /// `a · b`, stopping at the type's ends.
 #[must_use]
 #[inline(never)]
+pub const fn mul_i64(a: i64, b: i64) -> i64 {
+    a.saturating_mul(b)
+}
+
+/// `a · b`, stopping at the type's ends.
+#[must_use]
+#[inline(never)]
 pub const fn mul_i128(a: i128, b: i128) -> i128 {
     a.saturating_mul(b)
 }
@@ -320,8 +328,16 @@ pub const fn clamp_i64(value: i128) -> i64 {
 
 /// The nearest `i32`.
 #[must_use]
-#[expect(clippy::cast_possible_truncation, reason = "the range is checked")]
+#[inline(never)]
 pub const fn clamp_i32(value: i64) -> i32 {
+    clamp_i32_inline(value)
+}
+
+/// As [`clamp_i32`], without the call: for what is done with every sample.
+#[must_use]
+#[inline(always)]
+#[expect(clippy::cast_possible_truncation, reason = "the range is checked")]
+pub const fn clamp_i32_inline(value: i64) -> i32 {
     if value > i32::MAX as i64 {
         i32::MAX
     } else if value < i32::MIN as i64 {

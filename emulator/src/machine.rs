@@ -16,6 +16,7 @@ use crate::mcu::iwdg::Iwdg;
 use crate::mcu::rcc::{Rcc, ResetCause};
 use crate::mcu::system_bus::{Failure, SystemBus};
 use crate::mcu::tim2::Tim2;
+use crate::mcu::usart::Usart;
 use crate::mcu::{Unmodelled, system_memory};
 use crate::outside::PORTS;
 use crate::rtt::{Log, Memory};
@@ -270,6 +271,11 @@ impl<'table> Machine<'table> {
     /// Works on TIM2, which gives the image its time in µs.
     pub fn timer<T>(&mut self, work: impl FnOnce(&mut Tim2) -> T) -> T {
         self.bus.with_timer(work)
+    }
+
+    /// Looks at USART2.
+    pub fn usart<T>(&mut self, work: impl FnOnce(&Usart) -> T) -> T {
+        self.bus.with_usart(work)
     }
 
     /// Works on ADC1.

@@ -58,9 +58,7 @@ fn modbus(arguments: &[&str]) -> Command {
     let mut command = client("modbus_client.py");
     command
         .args(arguments)
-        // A request that comes while the image takes over a changed configuration can be lost to a character overrun
-        // (docs/modbus.md, Known defect): about one in a thousand here. More than two are too many.
-        .args(["--repeats", "2"])
+        .args(["--repeats", "0"])
         .arg("--map")
         .arg(project("docs/modbus.md"))
         .arg("--configuration")

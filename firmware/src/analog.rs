@@ -4,7 +4,7 @@
 //! the internal reference takes that out. Of the three conversions of a tick only the network's, 4.6 µs, is waited for: the
 //! internal channel's goes on from the end of one tick to the next, and the supply's runs beside the tick's own work.
 
-use core_logic::units::{Microvolts, MilliCelsius, clamp_i32, div_round};
+use core_logic::units::{Microvolts, MilliCelsius, clamp_i32, div_round, mul_i64};
 use stm32f4xx_hal::{
     pac::{ADC_COMMON, ADC1, RCC},
     rcc::{Enable, Reset},
@@ -99,7 +99,7 @@ impl Analog {
     fn microvolts(&self, code: i64, divider: i64) -> Option<Microvolts> {
         let vdda = self.vdda_uv?;
         Some(Microvolts(clamp_i32(div_round(
-            code.saturating_mul(vdda).saturating_mul(divider),
+            mul_i64(mul_i64(code, vdda), divider),
             FULL_SCALE,
         ))))
     }
@@ -112,10 +112,8 @@ impl Analog {
         if span <= 0 {
             return None; // Never calibrated.
         }
-        let at_calibration_supply = div_round(
-            code.saturating_mul(self.vdda_uv?),
-            CALIBRATION_VDDA_UV / 1_000,
-        );
+        let at_calibration_supply =
+            div_round(mul_i64(code, self.vdda_uv?), CALIBRATION_VDDA_UV / 1_000);
         let above_30 = at_calibration_supply - at_30 * 1_000;
         Some(MilliCelsius(clamp_i32(
             30_000 + div_round(above_30 * 80, span),

@@ -47,7 +47,7 @@ pub struct Edges {
 }
 
 impl Edges {
-    /// The edge interrupt, at priority 4; `now` was read before anything else.
+    /// The edge interrupt, at priority 5; `now` was read before anything else.
     ///
     /// The pending bit is cleared before the level is read: an edge after that asks for another interrupt.
     #[inline]

@@ -6,7 +6,7 @@ use core_logic::{
     converter::ConverterSample,
     diagnosis::{Code, CodeSet},
     measurement::{ConverterFault, Environment, Found, Measurement, Vehicle},
-    meter::{GapBridge, MeterConfig, MeterReport},
+    meter::{GapBridge, MeterCalibration, MeterReport},
     modbus::Readings,
     range::RangeHistory,
     retained::{RetainSlots, RetainedState},
@@ -40,8 +40,8 @@ pub struct MeterLink {
     pub latency_us: u32,
     /// To the meter: what bridges a gap.
     pub bridge: GapBridge,
-    /// To the meter: another calibration.
-    pub config: MeterConfig,
+    /// To the meter: another calibration, until it has taken it.
+    pub calibration: Option<MeterCalibration>,
 }
 
 /// What other owners report for the diagnosis.
@@ -146,11 +146,12 @@ impl Center {
         slots: RetainSlots,
         loss: core_logic::units::Nanocoulombs,
         now: Instant,
-    ) -> MeterConfig {
+    ) -> Option<MeterCalibration> {
         self.measurement = Measurement::new(&configuration, state, loss, now);
         self.configuration = configuration;
         self.slots = slots;
-        self.measurement.meter_config(&self.configuration)
+        self.measurement
+            .changed_meter_calibration(&self.configuration)
     }
 
     /// Another configuration is active.
@@ -217,9 +218,9 @@ impl Center {
         }
         self.log_due |= !tick.changes.cleared.is_empty();
         self.send(now);
-        if let Some(config) = self.measurement.changed_meter_config(&self.configuration) {
-            link.config = config;
-        }
+        link.calibration = self
+            .measurement
+            .changed_meter_calibration(&self.configuration);
         if self.ticks.is_multiple_of(10) {
             let (slot, bytes) = self.slots.write(&self.measurement.retained(0));
             retain::set_slot(slot, &bytes);

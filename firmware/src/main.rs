@@ -174,8 +174,8 @@ mod app {
         let configuration = *store.active();
         let board = Board::start(cx.device, &configuration);
         Mono::start(cx.core.SYST, clock::CORE_HZ);
-        // SAFETY: the exception is not enabled for anybody yet. Below the range edge: the timer queue's work must not
-        // delay a time stamp. 4 of RTIC's priorities are the top 4 of the 16.
+        // SAFETY: the exception is not enabled for anybody yet. Below the range edge and RS485: the timer queue's
+        // work must not delay a time stamp or cost a character. RTIC's 5 priorities are the top 5 of the 16.
         unsafe {
             cx.core.SCB.set_priority(
                 cortex_m::peripheral::scb::SystemHandler::SysTick,
@@ -206,7 +206,7 @@ mod app {
                 storms: 0,
                 latency_us: 0,
                 bridge: GapBridge::Unknown,
-                config: meter_config,
+                calibration: None,
             },
             port: board.rs485,
             center,
@@ -305,7 +305,7 @@ mod app {
     }
 
     /// Range-flag edge. Deadline 5 µs: a miss makes the edge's time stamp late by as much.
-    #[task(binds = EXTI0, priority = 4, shared = [edges])]
+    #[task(binds = EXTI0, priority = 5, shared = [edges])]
     fn range_edge(mut cx: range_edge::Context) {
         let now = time::now();
         cx.shared.edges.lock(|edges| edges.on_interrupt(now));
@@ -370,9 +370,12 @@ mod app {
                 bound |= core::mem::replace(&mut storms_seen, storms) != storms;
             }
             interrupt |= events & event::IRQ != 0;
-            let (bridge, config) = cx.shared.meter_link.lock(|link| (link.bridge, link.config));
-            if *meter.channel().config() != config {
-                meter.channel().set_config(config);
+            let (bridge, calibration) = cx
+                .shared
+                .meter_link
+                .lock(|link| (link.bridge, link.calibration.take()));
+            if let Some(calibration) = calibration {
+                meter.channel().set_calibration(calibration);
             }
             // Without a counting chip there is nothing to hand over.
             edge &= meter.is_counting();
@@ -573,7 +576,9 @@ mod app {
             cx.local.analog.end_tick();
             cx.shared.meter_link.lock(|shared| {
                 shared.bridge = link.bridge;
-                shared.config = link.config;
+                if link.calibration.is_some() {
+                    shared.calibration = link.calibration;
+                }
             });
             cx.local.lines.permit(permit);
             alive(Task::Environment);
@@ -604,8 +609,9 @@ mod app {
             .lock(|center| center.bus.on_error(time::now()));
     }
 
-    /// RS485 characters. Deadline 95 µs, one character: a miss spoils the request, which is counted.
-    #[task(binds = USART2, priority = 3, local = [characters_in], shared = [port])]
+    /// RS485 characters. Deadline 95 µs, one character: a miss spoils the request, which is counted. Above the meter's
+    /// owner, whose steps may take longer than that.
+    #[task(binds = USART2, priority = 4, local = [characters_in], shared = [port])]
     fn rs485_character(mut cx: rs485_character::Context) {
         if cx
             .shared
@@ -844,9 +850,9 @@ mod app {
         // Without a record the next start could not even say that something was lost.
         let mut first_save = !matches!(state, Stored::Value(_));
         let retained = retained_state(cx.local.previous, state);
-        let (charge, meter_config) = cx.shared.center.lock(|center| {
+        let (charge, calibration) = cx.shared.center.lock(|center| {
             let (state, slots, loss) = &retained;
-            let meter_config = center.resume(configuration, state.as_ref(), *slots, *loss, now);
+            let calibration = center.resume(configuration, state.as_ref(), *slots, *loss, now);
             center.identity.configuration_crc = configuration.crc();
             if matches!(stored, Stored::Refused) {
                 center
@@ -854,9 +860,11 @@ mod app {
                     .happened
                     .set(Code::ConfigurationDefault, true);
             }
-            (state.as_ref().map(|state| state.charge_total), meter_config)
+            (state.as_ref().map(|state| state.charge_total), calibration)
         });
-        cx.shared.meter_link.lock(|link| link.config = meter_config);
+        cx.shared
+            .meter_link
+            .lock(|link| link.calibration = calibration);
         defmt::info!(
             "configuration {=u32:08x}, charge {}",
             configuration.crc(),

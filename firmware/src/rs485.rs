@@ -1,7 +1,8 @@
 //! RS485 on USART2, 115,200 baud 8E1, half duplex with a driver enable.
 //!
 //! The interrupt only moves characters; frames and answers are `core_logic::modbus_rtu`'s, at priority 1. A character
-//! takes 95 µs, so the interrupt runs at priority 3: the longest that can hold it up there is one SPI transaction.
+//! takes 95 µs, less than the meter's owner may take at priority 3, so the interrupt runs at 4, below the range edge alone.
+//! docs/firmware.md has the bound on its wait.
 
 use core_logic::{
     design_parameters::RS485_BAUD,

@@ -182,6 +182,9 @@ pub struct Card {
     pub stage: Stage,
 }
 
+/// A first-order filter, a linear drift or a branch of resistance and capacitance describes a real part to some percent.
+const IDEALISED: f64 = 0.03;
+
 /// An effect of the library.
 pub trait Effect: Sync {
     /// What is said of it.
@@ -204,6 +207,11 @@ pub trait Effect: Sync {
     /// What the readings show by themselves, whatever the simulation says.
     fn mark(&self, _scale: &Scale, _clues: &Clues<'_>) -> Option<Mark> {
         None
+    }
+
+    /// Share of its own change by which its equation may be off: most are idealisations of what happens.
+    fn idealised(&self) -> f64 {
+        IDEALISED
     }
 
     /// What follows from the values, in plain words.

@@ -17,7 +17,7 @@ use std::time::Instant;
 
 use crate::effects::chain::{Chain, Nuisance};
 use crate::effects::scene::Scale;
-use crate::effects::{Effect, Search, find, find_with};
+use crate::effects::{Effect, Search, Stage, find, find_with};
 use crate::problem::Problem;
 use crate::report::data::{
     EffectReport, FittedModel, HoldoutReport, Inputs, Location, ParameterReport, Report,
@@ -35,11 +35,18 @@ const LEFT: f64 = 0.04;
 const STRUCTURE: f64 = 0.1;
 /// What remains is too loud from this multiple of the stated noise on.
 const LOUD: f64 = 1.3;
+/// Where no noise is stated, a mismatch is more than noise with a memory from this multiple of its jumps on.
+const SLOW: f64 = 10.0;
+/// Where no effect passes, loudness is judged by this share of the residual's sizes, which is so many standard deviations of a
+/// normal distribution: single readings at wrong moments are no unknown physics.
+const COMMON: (f64, f64) = (0.8, 1.2816);
 /// From this correlation on, what is left sits where the named effects act: their shape is wrong.
 const ALIKE: f64 = 0.35;
 /// From this ratio of what is left explainable to what the named effects explain on, their names are not to be trusted: another
 /// physics of the same shape would leave as much.
 const DOUBTFUL: f64 = 0.12;
+/// Below this ratio it is traces, wherever they sit: even a true effect's equation is a model.
+const TRACES: f64 = 0.02;
 /// An effect that makes the error in another file larger by this factor is not that file's physics.
 const WORSE: f64 = 1.05;
 /// A file that was never fitted confirms the effects if they bring its error down to this share.
@@ -182,7 +189,15 @@ fn one(
     vague(&bench, &mut selection, options.seed);
     let left = features.explain(&selection.fit.residual, options.seed);
     let confirmed = confirmed(&selection, problem, holdouts);
-    let verdict = judge(&bench, &mut selection, &features, confirmed, before, left);
+    let verdict = judge(
+        &bench,
+        &mut selection,
+        &features,
+        confirmed,
+        before,
+        left,
+        options.seed,
+    );
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);
@@ -388,9 +403,15 @@ fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<Stri
             .enumerate()
             .filter(|(_, (parameter, _))| !parameter.internal)
     };
+    // Where one size is told (a knee), another (how soft it is) need not be.
+    let mut sizes = known()
+        .filter(|(_, (parameter, _))| parameter.search == Search::Logarithmic)
+        .map(|(_, (_, [low, high]))| *high > VAGUE * low)
+        .peekable();
+    let vague = sizes.peek().is_some() && sizes.all(|vague| vague);
     for (index, (parameter, [low, high])) in known() {
         let (lowest, highest) = member.effect.bounds(index, scale);
-        let magnitudes = parameter.search == Search::Logarithmic && *high > VAGUE * low;
+        let magnitudes = vague && parameter.search == Search::Logarithmic;
         let whole = !parameter.open && low <= &lowest && high >= &highest;
         if magnitudes || whole {
             return Some(format!(
@@ -429,6 +450,42 @@ fn elsewhere(model: &Model) -> Model {
     }
 }
 
+/// The size that a share of a series stays below.
+fn quantile(series: &[f64], share: f64) -> f64 {
+    let mut sizes: Vec<f64> = series.iter().map(|value| value.abs()).collect();
+    sizes.sort_unstable_by(f64::total_cmp);
+    let at = (sizes.len() as f64 * share) as usize;
+    sizes.get(at).copied().unwrap_or_default()
+}
+
+/// Energy that a true model would leave: the stated noise, as it comes through the end of the chain.
+fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
+    let count = bench.len() as f64;
+    let noise = bench.problem.noise;
+    let ends = fit
+        .model
+        .members
+        .iter()
+        .any(|member| member.effect.card().stage == Stage::Output);
+    if noise > 0.0 && ends {
+        let energy = bench.noise_energy(&fit.model, &fit.predicted, noise, seed);
+        energy.max(noise * noise * count)
+    } else if noise > 0.0 {
+        noise * noise * count
+    } else {
+        // A grid is told by the readings; reading and simulation are both on it.
+        let clues = bench.clues(&fit.predicted);
+        let grid: f64 = fit
+            .model
+            .members
+            .iter()
+            .filter_map(|member| member.effect.mark(&bench.scale, &clues))
+            .map(|mark| mark.variance)
+            .sum();
+        2.0 * grid * count
+    }
+}
+
 /// The verdict on one signal. Where the names are not to be trusted, the effects are taken back.
 fn judge(
     bench: &Workbench<'_>,
@@ -437,10 +494,29 @@ fn judge(
     confirmed: bool,
     before: Explainable,
     left: Explainable,
+    seed: u64,
 ) -> Verdict {
-    let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
+    let count = bench.len().max(1) as f64;
+    let noise = bench.problem.noise;
+    let known = noise.max(bench.problem.accuracy.zero);
     if selection.named.is_empty() {
-        return if before.is_real() && before.share > STRUCTURE {
+        let residual = &selection.plain.residual;
+        let common =
+            (quantile(residual, COMMON.0) / COMMON.1).min(rms(residual.iter().copied()));
+        // What the readings jump by from one to the next is the most that noise without a memory can be.
+        let (floor, times, of) = if noise > 0.0 {
+            (known, LOUD, "the noise that the model file states")
+        } else {
+            let jumps = fit::spread(&jumps(residual)) / std::f64::consts::SQRT_2;
+            (known.max(jumps), SLOW, "what it changes from reading to reading")
+        };
+        return if floor > 0.0 && common > times * floor {
+            selection.decisions.push(format!(
+                "No effect passes, yet all over the recording the mismatch is {} times {of}: unknown.",
+                short(common / floor)
+            ));
+            Verdict::Unknown
+        } else if before.is_real() && before.share > STRUCTURE {
             selection.decisions.push(format!(
                 "No effect passes, yet a smooth function of the recorded inputs takes {} of the held-out error (placebos up to {}): unknown.",
                 percent(before.share),
@@ -454,19 +530,20 @@ fn judge(
             Verdict::NoMismatch
         };
     }
-    let count = bench.len().max(1) as f64;
-    let explained = energy(&selection.plain) - energy(&selection.fit);
+    let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
     let rest = energy(&selection.fit);
+    let unavoidable = unavoidable(bench, &selection.fit, seed);
+    let quiet = noise * noise * count;
+    let explained = energy(&selection.plain) - rest + (unavoidable - quiet);
     let smooth = if left.is_real() && left.share > LEFT {
         left.share * rest
     } else {
         0.0
     };
     // What is beyond the noise that the design states is structure too, whatever the inputs say of it.
-    let noise = bench.problem.noise;
-    let known = noise.max(bench.problem.accuracy.zero);
-    let beyond = if noise > 0.0 && rest > (LOUD * known).powi(2) * count {
-        rest - known * known * count
+    let allowed = unavoidable.max(known * known * count);
+    let beyond = if noise > 0.0 && rest > LOUD * LOUD * allowed {
+        rest - allowed
     } else {
         0.0
     };
@@ -481,7 +558,7 @@ fn judge(
     if beyond > 0.0 {
         selection.decisions.push(format!(
             "What remains is {} times the noise that the model file states.",
-            short((rest / count).sqrt() / noise)
+            short((rest / unavoidable).sqrt())
         ));
     }
     if smooth > 0.0 || beyond > 0.0 {
@@ -505,7 +582,7 @@ fn judge(
         } else {
             0.0
         };
-        if !confirmed && (ratio > DOUBTFUL || alike > ALIKE) {
+        if !confirmed && (ratio > DOUBTFUL || (alike > ALIKE && ratio > TRACES)) {
             let ids = selection.fit.model.ids().join(", ");
             selection.refused.push(format!(
                 "{ids}: the best of the library, but so much structure is left, and where these effects act, that the true physics is likely another"

@@ -104,6 +104,8 @@ pub struct Charge {
     pub noise_c: f64,
     /// Time from the counter's reading to the row that tells of it, in s.
     pub age_s: f64,
+    /// Width of the time within which that moment is uncertain, in s.
+    pub jitter_s: f64,
 }
 
 /// `[battery]`, resolved: the table is read.
@@ -385,6 +387,7 @@ fn check_charge(charge: &Charge, places: &Places<'_>) -> Result<(), Failure> {
             ("step_c", charge.step_c),
             ("noise_c", charge.noise_c),
             ("age_s", charge.age_s),
+            ("jitter_s", charge.jitter_s),
             ("interval_s", charge.interval_s.unwrap_or(0.0)),
         ],
     )

@@ -22,7 +22,7 @@ use crate::{
     align, explain,
     failure::Failure,
     model::{Model, Sensor, registry},
-    problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View},
+    problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View},
     simulate::board::{Board, Pace},
 };
 
@@ -328,6 +328,10 @@ impl Work<'_> {
             modelled: Vec::new(),
             noise: (sensor.noise.powi(2) + sensor.noise_coloured.powi(2) + step * step / 12.0)
                 .sqrt(),
+            coloured: Coloured {
+                rms: sensor.noise_coloured,
+                tau_s: sensor.noise_coloured_tau_s,
+            },
             accuracy: Accuracy {
                 zero: sensor.accuracy.zero,
                 gain: sensor.accuracy.gain,

@@ -130,8 +130,19 @@ pub struct Problem {
     /// Standard deviation of the noise that the design specifies for one reading (white and quantisation), in the view's unit;
     /// 0 if nothing is stated.
     pub noise: f64,
+    /// The part of `noise` that has a memory.
+    pub coloured: Coloured,
     /// Accuracy of the reference instrument, in the view's unit: a constant part and a share of the reading.
     pub accuracy: Accuracy,
+}
+
+/// Noise whose correlation falls exponentially with time.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Coloured {
+    /// Standard deviation, in the view's unit.
+    pub rms: f64,
+    /// Time in which the correlation falls to 1/e, in s.
+    pub tau_s: f64,
 }
 
 /// Accuracy of an instrument: `zero + gain·abs(reading)`.

@@ -76,19 +76,21 @@ pub fn lines(t_s: &[f64], values: &[f64], step_s: f64) -> Vec<Line> {
         if here < power[at - 1] || here < power[at + 1] {
             continue;
         }
-        let around = at.saturating_sub(2 * NEIGHBOURS).max(1)..(at + 2 * NEIGHBOURS).min(half);
-        let mut others: Vec<f64> = around
-            .filter(|other| other.abs_diff(at) > 10)
-            .map(|other| power[other])
-            .collect();
-        if others.len() < 20 {
-            continue;
-        }
-        let middle = others.len() / 2;
-        // The median of an exponential distribution is ln 2 times its mean.
-        let mean =
-            *others.select_nth_unstable_by(middle, f64::total_cmp).1 / std::f64::consts::LN_2;
-        if mean > 0.0 && here / mean > threshold {
+        let left = at.saturating_sub(2 * NEIGHBOURS).max(1)..at.saturating_sub(10);
+        let right = (at + 11).min(half)..(at + 2 * NEIGHBOURS).min(half);
+        let others = [
+            power.get(left).unwrap_or_default(),
+            power.get(right).unwrap_or_default(),
+        ];
+        // The median of an exponential distribution is ln 2 times its mean. It is below a limit if more than half of the values
+        // are: no need to sort them. Either side is asked for itself: coloured noise falls from one to the other.
+        let limit = here * std::f64::consts::LN_2 / threshold;
+        let stands_out = |values: &[f64]| {
+            let below = |limit: f64| values.iter().filter(|value| **value < limit).count();
+            below(limit) > values.len() / 2 && below(f64::MIN_POSITIVE) <= values.len() / 2
+        };
+        let sides = others.iter().filter(|values| values.len() >= 10);
+        if sides.clone().count() > 0 && sides.into_iter().all(|values| stands_out(values)) {
             found.push((at, here));
         }
     }

@@ -11,7 +11,7 @@ use std::path::Path;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 use twin::explain::{Options, explain};
-use twin::problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View};
+use twin::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
 use twin::report::data::{Report, Verdict};
 
 const ROWS: usize = 9000;
@@ -112,6 +112,7 @@ fn explained(truth: &Truth, reading: Vec<f64>, seed: u64, without: &[&str]) -> R
         }),
         modelled: Vec::new(),
         noise: NOISE_A,
+        coloured: Coloured::default(),
         accuracy: Accuracy::default(),
     };
     let options = Options {

@@ -18,7 +18,7 @@ use twin::{
     explain,
     model::{FrontEndKind, Model},
     prepare::{Inputs, Prepared, Purpose, prepare},
-    problem::{Base, BatteryBase, Drive, Observed, Problem, SensorBase, View},
+    problem::{Base, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, View},
     simulate::{
         board::{Board, Pace},
         command::columns,
@@ -226,6 +226,7 @@ fn problem(view: View, base: Base, drive: Drive, observed: Observed) -> Problem 
         base,
         modelled: Vec::new(),
         noise: 0.0,
+        coloured: Coloured::default(),
         accuracy: Default::default(),
     }
 }

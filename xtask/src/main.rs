@@ -1,4 +1,4 @@
-//! The project's commands: `cargo xtask demo`, `test`, `emulate`, `bench`, `build`, `size`, `flash`, `doc`, `setup`.
+//! The project's commands: `cargo xtask demo`, `test`, `prove`, `emulate`, `bench`, `build`, `size`, `flash`, `doc`, `setup`.
 //!
 //! Everything a command needs beyond a Rust compiler for the host (a compiler for the board, QEMU, ngspice, Python
 //! with its packages) is found or installed by the command itself; docs/toolchain.md says how.
@@ -14,6 +14,7 @@ mod image;
 mod instruction_count;
 mod lint;
 mod process;
+mod prove;
 mod python;
 mod qemu;
 mod report;
@@ -62,6 +63,15 @@ enum Command {
     /// Set up what is missing, then run every check and every test
     #[command(after_help = "Example:\n  cargo xtask test")]
     Test,
+    /// Run the proof campaign: concealed effects, other people's simulators, real recordings, today's methods
+    #[command(
+        after_help = "Examples:\n  cargo xtask prove            all of it, into docs/proof; goes on where a broken run was\n  cargo xtask prove --quick    the small part that `cargo xtask test` runs, into target/prove/quick"
+    )]
+    Prove {
+        /// Only the small part
+        #[arg(long)]
+        quick: bool,
+    },
     /// Run the release image on the emulated board (`--help` tells the arguments)
     #[command(disable_help_flag = true)]
     Emulate {
@@ -120,6 +130,10 @@ fn run(command: &Command) -> Result<ExitCode> {
         } else {
             ExitCode::from(FAILED)
         }),
+        Command::Prove { quick } => {
+            prove::run(&workspace, *quick)?;
+            Ok(ExitCode::SUCCESS)
+        }
         Command::Emulate { arguments } => match emulate::run(&workspace, "drive", arguments)? {},
         Command::Bench { arguments } => match emulate::run(&workspace, "bench", arguments)? {},
         Command::Build => {
@@ -163,6 +177,8 @@ fn run(command: &Command) -> Result<ExitCode> {
             );
             let python = python::environment(&workspace)?;
             eprintln!("python: {}", python.display());
+            let proof = python::proof_environment(&workspace)?;
+            eprintln!("python of the proof campaign: {}", proof.display());
             let logs = foreign_logs::make(&workspace, &python)?;
             eprintln!("logs by other tools: {}", logs.display());
             Ok(ExitCode::SUCCESS)

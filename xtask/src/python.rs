@@ -18,9 +18,22 @@ const LISTS: [&str; 3] = [
     "recording/python/requirements.txt",
 ];
 
-/// The environment's interpreter; makes the environment if one of [`LISTS`] changed or it is not there.
+/// What the proof campaign uses: simulators and methods of others. An environment of its own, for their numpy is not the
+/// logs'.
+const PROOF: [&str; 1] = ["proof/requirements.txt"];
+
+/// The interpreter of the tests' environment; makes the environment if one of [`LISTS`] changed or it is not there.
 pub fn environment(workspace: &Workspace) -> Result<PathBuf> {
-    let lists = LISTS.map(|list| workspace.root.join(list));
+    environment_of(workspace, &LISTS)
+}
+
+/// The same for the proof campaign.
+pub fn proof_environment(workspace: &Workspace) -> Result<PathBuf> {
+    environment_of(workspace, &PROOF)
+}
+
+fn environment_of(workspace: &Workspace, lists: &[&str]) -> Result<PathBuf> {
+    let lists: Vec<PathBuf> = lists.iter().map(|list| workspace.root.join(list)).collect();
     let mut hasher = DefaultHasher::new();
     for list in &lists {
         fs::read_to_string(list)

@@ -3,7 +3,7 @@
 use anyhow::{Result, bail};
 
 use crate::{
-    apt, dbc, doc, foreign_logs, image, instruction_count, lint, python, qemu, report,
+    apt, dbc, doc, foreign_logs, image, instruction_count, lint, prove, python, qemu, report,
     steps::Steps,
     tests_on_host, toolchain,
     workspace::{self, Workspace},
@@ -38,6 +38,9 @@ pub fn run(workspace: &Workspace) -> Result<bool> {
         Ok(program)
     });
     let python = steps.step("set-up: Python", || python::environment(workspace));
+    let proof_python = steps.step("set-up: Python of the proof campaign", || {
+        python::proof_environment(workspace)
+    });
     let logs = match &python {
         Some(python) => steps.step("set-up: logs by other tools", || {
             foreign_logs::make(workspace, python)
@@ -78,6 +81,7 @@ pub fn run(workspace: &Workspace) -> Result<bool> {
         None => steps.skip("instruction counts", "there is no compiler for the board"),
     }
     steps.step("documentation", || doc::build(workspace));
+    let image = elf.clone();
     let provided = vec![
         ("HALLMARK_IMAGE", elf),
         ("HALLMARK_CPU_PROGRAMS", programs),
@@ -94,6 +98,13 @@ pub fn run(workspace: &Workspace) -> Result<bool> {
         }
         Ok(())
     });
+
+    match (&image, &proof_python) {
+        (Some(image), Some(python)) => {
+            steps.step("proof, quick", || prove::quick(workspace, image, python));
+        }
+        _ => steps.skip("proof, quick", "there is no image or no Python for it"),
+    }
 
     steps.print_times();
     let failed = steps.print_failures();

@@ -494,6 +494,11 @@ impl SystemBus {
         work(&mut self.lock().adc1)
     }
 
+    /// Works on USART2, for what it knows of how it is served.
+    pub fn with_usart<T>(&self, work: impl FnOnce(&Usart) -> T) -> T {
+        work(&self.lock().usart2)
+    }
+
     /// Works on TIM2, for a clock that is about to wrap.
     pub fn with_timer<T>(&self, work: impl FnOnce(&mut Tim2) -> T) -> T {
         let mut state = self.lock();

@@ -91,6 +91,9 @@ pub struct Usart {
     /// When the line has been idle for a frame.
     idle_at: Option<Ticks>,
     missed: u64,
+    /// When the character in DR came.
+    received_at: Ticks,
+    longest_wait: Ticks,
 }
 
 impl Usart {
@@ -110,12 +113,20 @@ impl Usart {
             receiver_since: None,
             idle_at: None,
             missed: 0,
+            received_at: Ticks(0),
+            longest_wait: Ticks(0),
         }
     }
 
     /// Characters that came while the receiver was off or began before it was on.
     pub const fn missed(&self) -> u64 {
         self.missed
+    }
+
+    /// The longest time from the end of a character on the line until the software fetched it from DR; where the next one
+    /// was lost meanwhile it is longer than a character.
+    pub const fn longest_wait(&self) -> Ticks {
+        self.longest_wait
     }
 
     /// Baud rate by BRR; 0 without a divider.
@@ -180,6 +191,7 @@ impl Usart {
             let parity = even_parity(character.byte) ^ character.parity_error;
             self.received = u16::from(character.byte) | u16::from(parity) << 8;
             self.status |= RXNE;
+            self.received_at = at;
             for (bit, set) in [
                 (PE, character.parity_error),
                 (FE, character.framing_error),
@@ -287,6 +299,10 @@ impl Peripheral for Usart {
                 self.status
             }
             DR => {
+                if self.status & RXNE != 0 {
+                    let wait = context.now.since(self.received_at);
+                    self.longest_wait = self.longest_wait.max(wait);
+                }
                 self.status &= !RXNE;
                 if std::mem::take(&mut self.read_for_receive) {
                     self.status &= !(PE | FE | NF | ORE | IDLE);
@@ -361,6 +377,7 @@ impl Peripheral for Usart {
     fn reset(&mut self, context: &mut Context<'_>) {
         *self = Self {
             missed: self.missed,
+            longest_wait: self.longest_wait,
             ..Self::new(self.line_baud)
         };
         self.update_interrupt(context);

@@ -138,8 +138,6 @@ pub struct CurrentFrame {
 /// The board on a bench.
 pub struct Bench<'firmware> {
     pub rig: Rig<'firmware>,
-    /// Requests that had to be repeated because no answer came.
-    pub repeats: u32,
     map: Map,
     decoder: BusView,
 }
@@ -157,7 +155,6 @@ impl<'firmware> Bench<'firmware> {
     pub fn powered(firmware: &'firmware Firmware, setup: Setup) -> Self {
         Self {
             rig: Rig::new(firmware, setup).unwrap(),
-            repeats: 0,
             map: Map::documented(),
             decoder: BusView::default(),
         }
@@ -250,15 +247,7 @@ impl<'firmware> Bench<'firmware> {
         let mut request = ModbusRequest::new(1, ModbusProto::Rtu);
         let mut frame = Vec::new();
         generate(&mut request, &mut frame)?;
-        let answer = match self.exchange(&frame) {
-            Ok(answer) => answer,
-            // As every client does.
-            Err(error) => {
-                self.repeats += 1;
-                println!("{:.3} s: {error:#}; repeated", self.now_s());
-                self.exchange(&frame).unwrap()
-            }
-        };
+        let answer = self.exchange(&frame).unwrap();
         request.parse_ok(&answer)?;
         let mut words = Vec::new();
         if matches!(frame[1], 3 | 4) {

@@ -1,6 +1,6 @@
 //! The cell warms itself.
 
-use super::scene::{Scale, Scene, ladder};
+use super::scene::{Scale, Scene, arrhenius};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
@@ -14,7 +14,7 @@ pub struct CellSelfHeating;
 static CARD: Card = Card {
     id: "cell-self-heating",
     statement: "Losses warm the cell, which lowers its resistance.",
-    equation: "T = T₀ + rth·LP(R·i²), LP: first order with τ; R(T) with B of resistance-temperature, 2000 K without it",
+    equation: "T = T₀ + rth·LP(R(T₀)·i²), LP: first order with τ; R(T) with B of resistance-temperature, 2000 K without it",
     parameters: &[
         Parameter::new("rth_k_per_w", "K/W", 0.0, Search::Smooth),
         Parameter::new("tau_s", "s", 300.0, Search::Logarithmic),
@@ -50,18 +50,24 @@ impl Effect for CellSelfHeating {
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
-        let drive = scene.drive;
+        let (drive, steps) = (scene.drive, scene.steps.clone());
         let Some(battery) = &mut scene.battery else {
             return;
         };
         let ohms = battery.base.resistance_ohm;
-        let losses: Vec<f64> = scene.signal.iter().map(|i| ohms * i * i).collect();
-        let heat = ladder(&drive.t_s, &drive.segments, &losses, [values[1]], [1.0]);
+        let b_k = *battery.arrhenius_k.get_or_insert(USUAL_B_K);
+        // At the temperature that the cell would have without the warming: that lowers R by a few percent only.
+        let losses: Vec<f64> = scene
+            .signal
+            .iter()
+            .zip(&battery.temperature_c)
+            .map(|(i, t)| ohms * arrhenius(b_k, *t) * i * i)
+            .collect();
+        let heat = steps.ladder(&drive.segments, &losses, [values[1]], [1.0]);
         battery
             .temperature_c
             .iter_mut()
             .zip(heat)
             .for_each(|(t, watts)| *t += values[0] * watts);
-        battery.arrhenius_k = battery.arrhenius_k.or(Some(USUAL_B_K));
     }
 }

@@ -1,6 +1,6 @@
 //! Runs the simulation with effects, in the order of their stages.
 
-use super::scene::Scene;
+use super::scene::{Scene, boxcar};
 use super::{Effect, Stage};
 use crate::problem::{Base, Problem, View};
 
@@ -22,15 +22,53 @@ pub type Members<'a> = [(&'static dyn Effect, &'a [f64])];
 #[derive(Debug)]
 pub struct Chain<'a> {
     problem: &'a Problem,
+    /// How every run begins.
+    start: Scene<'a>,
     /// The reading as designed less what this chain gives without effects: what the chain does not model itself.
     beside: Vec<f64>,
 }
+
+/// One step of the simulation.
+#[derive(Clone, Copy)]
+enum Link<'m> {
+    /// An effect with its values, and its index among the members; effects of the model file have none.
+    Effect(&'static dyn Effect, &'m [f64], Option<usize>),
+    /// The averaging window by design.
+    Window,
+    /// From the drive's rows to the observation's.
+    Sample,
+    /// What the chain does not model itself.
+    Beside,
+    /// The state of charge and the open-circuit voltage.
+    Count,
+    /// The factor of resistance.
+    Warm,
+    /// The voltage, or the state of charge in %.
+    Terminals,
+}
+
+/// What changes from one run to the next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Change {
+    /// Values of the member at this index.
+    Member(usize),
+    /// [`Nuisance::soc_shift`].
+    SocShift,
+    /// [`Nuisance::resistance`].
+    Resistance,
+    /// [`Nuisance::alignment_s`].
+    Alignment,
+}
+
+/// A run that differs from another: by what, and the members and the nuisance with it.
+pub type Variation<'m> = (Change, Vec<(&'static dyn Effect, &'m [f64])>, Nuisance);
 
 impl<'a> Chain<'a> {
     /// For a problem.
     pub fn new(problem: &'a Problem) -> Self {
         let mut chain = Self {
             problem,
+            start: Scene::new(problem),
             beside: Vec::new(),
         };
         if let Base::Sensor(base) = &problem.base
@@ -54,75 +92,164 @@ impl<'a> Chain<'a> {
 
     /// What the simulation says at each observed row; NaN where the drive does not reach.
     pub fn run(&self, members: &Members<'_>, nuisance: Nuisance) -> Vec<f64> {
-        let problem = self.problem;
-        let mut scene = Scene::new(problem);
-        let mut order: Vec<(&'static dyn Effect, &[f64])> = problem
-            .modelled
-            .iter()
-            .filter_map(|(id, values)| {
-                Some((super::find_with(id, values.len())?, values.as_slice()))
-            })
-            .chain(members.iter().copied())
-            .collect();
-        order.sort_by_key(|(effect, _)| effect.card().stage);
-        let mut next = order.into_iter().peekable();
-        let mut apply_through = |scene: &mut Scene<'_>, last: Stage| {
-            while let Some((effect, values)) =
-                next.next_if(|(effect, _)| effect.card().stage <= last)
-            {
-                effect.apply(values, scene);
-            }
-        };
-        scene.delay_s = nuisance.alignment_s;
-        if let Base::Sensor(base) = &problem.base {
-            scene.delay_s += base.alignment_s;
-        }
-        match &problem.base {
-            Base::Sensor(base) => {
-                apply_through(&mut scene, Stage::Filter);
-                if base.window_s > 0.0 {
-                    let held = scene.held();
-                    let drive = scene.drive;
-                    scene.signal = super::scene::boxcar(
-                        &drive.t_s,
-                        &drive.segments,
-                        &scene.signal,
-                        base.window_s,
-                        held,
-                    );
-                }
-                apply_through(&mut scene, Stage::Converter);
-                scene.sample(problem.view);
+        self.run_with_noise(members, nuisance, &[])
+    }
+
+    /// The same with noise of the sensor, one value for each observed row, ahead of what ends the chain (steps, thresholds,
+    /// rails).
+    pub fn run_with_noise(
+        &self,
+        members: &Members<'_>,
+        nuisance: Nuisance,
+        noise: &[f64],
+    ) -> Vec<f64> {
+        let links = self.links(members);
+        let mut scene = self.start.clone();
+        for link in links {
+            self.apply(&mut scene, link, nuisance);
+            if matches!(link, Link::Beside) {
                 scene
                     .signal
                     .iter_mut()
-                    .zip(&self.beside)
-                    .for_each(|(value, beside)| *value += beside);
-                apply_through(&mut scene, Stage::BatteryVoltage);
-            }
-            Base::Battery(_) => {
-                if let Some(battery) = &mut scene.battery {
-                    battery.soc_shift = nuisance.soc_shift;
-                    battery.resistance = 1.0 + nuisance.resistance;
-                }
-                apply_through(&mut scene, Stage::BatteryCharge);
-                if let Some(battery) = &mut scene.battery {
-                    battery.count(scene.drive, &scene.signal);
-                }
-                apply_through(&mut scene, Stage::BatteryTemperature);
-                if let Some(battery) = &mut scene.battery {
-                    battery.warm();
-                }
-                apply_through(&mut scene, Stage::BatteryVoltage);
-                if let Some(battery) = &scene.battery {
-                    scene.signal = match problem.view {
-                        View::StateOfCharge => battery.soc.iter().map(|soc| 100.0 * soc).collect(),
-                        _ => battery.voltage(&scene.signal),
-                    };
-                }
-                scene.sample(problem.view);
+                    .zip(noise)
+                    .for_each(|(value, noise)| *value += noise);
             }
         }
         scene.signal
+    }
+
+    /// What variations of a simulation say, each through `take`: what comes before a change is run once for all of them.
+    pub fn vary(
+        &self,
+        members: &Members<'_>,
+        nuisance: Nuisance,
+        variations: &[Variation<'_>],
+        take: impl Fn(Vec<f64>) -> Vec<f64>,
+    ) -> Vec<Vec<f64>> {
+        let links = self.links(members);
+        let first: Vec<usize> = variations
+            .iter()
+            .map(|(change, _, _)| {
+                let tells = |link: &Link<'_>| match (change, link) {
+                    (Change::Member(index), Link::Effect(_, _, member)) => *member == Some(*index),
+                    (Change::SocShift, Link::Count)
+                    | (Change::Resistance, Link::Terminals)
+                    | (Change::Alignment, Link::Sample) => true,
+                    _ => false,
+                };
+                links.iter().position(tells).unwrap_or_default()
+            })
+            .collect();
+        let mut order: Vec<usize> = (0..variations.len()).collect();
+        order.sort_by_key(|k| first[*k]);
+        let mut outputs = vec![Vec::new(); variations.len()];
+        let mut scene = self.start.clone();
+        let mut done = 0;
+        for k in order {
+            for link in &links[done..first[k]] {
+                self.apply(&mut scene, *link, nuisance);
+            }
+            done = first[k];
+            let (_, members, nuisance) = &variations[k];
+            let mut varied = scene.clone();
+            for link in &self.links(members)[done..] {
+                self.apply(&mut varied, *link, *nuisance);
+            }
+            outputs[k] = take(varied.signal);
+        }
+        outputs
+    }
+
+    /// The steps of the simulation, in their order.
+    fn links<'m>(&'m self, members: &Members<'m>) -> Vec<Link<'m>> {
+        let mut order: Vec<Link<'m>> = Vec::with_capacity(members.len() + 4);
+        let mut effects: Vec<(&'static dyn Effect, &'m [f64], Option<usize>)> = self
+            .problem
+            .modelled
+            .iter()
+            .filter_map(|(id, values)| {
+                Some((super::find_with(id, values.len())?, values.as_slice(), None))
+            })
+            .chain(
+                members
+                    .iter()
+                    .enumerate()
+                    .map(|(index, (effect, values))| (*effect, *values, Some(index))),
+            )
+            .collect();
+        effects.sort_by_key(|(effect, _, _)| effect.card().stage);
+        let mut next = effects.into_iter().peekable();
+        let mut through = |order: &mut Vec<Link<'m>>, last: Stage| {
+            while let Some((effect, values, index)) =
+                next.next_if(|(effect, _, _)| effect.card().stage <= last)
+            {
+                order.push(Link::Effect(effect, values, index));
+            }
+        };
+        match &self.problem.base {
+            Base::Sensor(base) => {
+                through(&mut order, Stage::Filter);
+                if base.window_s > 0.0 {
+                    order.push(Link::Window);
+                }
+                through(&mut order, Stage::Converter);
+                order.extend([Link::Sample, Link::Beside]);
+                through(&mut order, Stage::BatteryVoltage);
+            }
+            Base::Battery(_) => {
+                through(&mut order, Stage::BatteryCharge);
+                order.push(Link::Count);
+                through(&mut order, Stage::BatteryTemperature);
+                order.push(Link::Warm);
+                through(&mut order, Stage::BatteryVoltage);
+                order.extend([Link::Terminals, Link::Sample]);
+            }
+        }
+        order
+    }
+
+    fn apply(&self, scene: &mut Scene<'_>, link: Link<'_>, nuisance: Nuisance) {
+        match link {
+            Link::Effect(effect, values, _) => effect.apply(values, scene),
+            Link::Window => {
+                let (held, drive) = (scene.held(), scene.drive);
+                let window_s = scene.sensor.map_or(0.0, |sensor| sensor.window_s);
+                scene.signal = boxcar(&drive.t_s, &drive.segments, &scene.signal, window_s, held);
+            }
+            Link::Sample => {
+                scene.delay_s +=
+                    nuisance.alignment_s + scene.sensor.map_or(0.0, |sensor| sensor.alignment_s);
+                scene.sample(self.problem.view);
+            }
+            Link::Beside => scene
+                .signal
+                .iter_mut()
+                .zip(&self.beside)
+                .for_each(|(value, beside)| *value += beside),
+            Link::Count => {
+                if let Some(battery) = &mut scene.battery {
+                    battery.soc_shift = nuisance.soc_shift;
+                    battery.count(scene.drive, &scene.signal);
+                    if self.problem.view != View::StateOfCharge {
+                        battery.open_circuit();
+                    }
+                }
+            }
+            Link::Warm => {
+                if let Some(battery) = &mut scene.battery {
+                    battery.warm();
+                }
+            }
+            Link::Terminals => {
+                if let Some(battery) = &mut scene.battery {
+                    battery.resistance = 1.0 + nuisance.resistance;
+                    if self.problem.view == View::StateOfCharge {
+                        scene.signal = battery.soc.iter().map(|soc| 100.0 * soc).collect();
+                    } else {
+                        battery.voltage(&mut scene.signal);
+                    }
+                }
+            }
+        }
     }
 }

@@ -36,6 +36,10 @@ impl Effect for ClockSkew {
             .collect()
     }
 
+    fn idealised(&self) -> f64 {
+        0.0
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         scene.skew += values[0] * 1e-6;
     }

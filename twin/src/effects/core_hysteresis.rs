@@ -30,7 +30,7 @@ impl Effect for CoreHysteresis {
 
     fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64) {
         if parameter == 0 {
-            // A core that keeps a field keeps it in the direction of the current.
+            // A core keeps a field in the direction of what flowed.
             (0.0, 0.2 * scale.full_scale)
         } else {
             (1e-3 * scale.full_scale, 0.5 * scale.full_scale)

@@ -13,7 +13,7 @@ static CARD: Card = Card {
     equation: "y(t) = i(t − delay)",
     parameters: &[Parameter::new("delay_s", "s", 0.0, Search::Smooth)],
     shows: "edges",
-    looks_like: &["lag", "clock-skew"],
+    looks_like: &["lag", "moving-average", "clock-skew"],
     separated_by: "steps of the current early and late in the recording",
     stage: Stage::Clock,
 };
@@ -34,6 +34,10 @@ impl Effect for Delay {
             .into_iter()
             .flat_map(|delay| [vec![delay], vec![-delay]])
             .collect()
+    }
+
+    fn idealised(&self) -> f64 {
+        0.0
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

@@ -1,6 +1,6 @@
 //! Solid diffusion.
 
-use super::scene::{Scale, Scene, ladder};
+use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
@@ -51,7 +51,7 @@ impl Effect for Diffusion {
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (ohms, tau) = (values[0], values[1]);
-        let drive = scene.drive;
+        let (drive, steps) = (scene.drive, scene.steps.clone());
         let Some(battery) = &mut scene.battery else {
             return;
         };
@@ -66,8 +66,7 @@ impl Effect for Diffusion {
             std::array::from_fn(|k| ((k as f64 + 0.5) * std::f64::consts::PI).powi(2));
         let weights = poles.map(|pole| ohms * 2.0 / pole);
         let left = ohms - weights.iter().sum::<f64>();
-        let slow = ladder(
-            &drive.t_s,
+        let slow = steps.ladder(
             &drive.segments,
             &driven,
             poles.map(|pole| tau / pole),

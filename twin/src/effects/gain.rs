@@ -31,6 +31,10 @@ impl Effect for Gain {
         vec![vec![1.01]]
     }
 
+    fn idealised(&self) -> f64 {
+        0.0
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let gain = values[0];
         scene.signal.iter_mut().for_each(|value| *value *= gain);

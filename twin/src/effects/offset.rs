@@ -31,6 +31,10 @@ impl Effect for Offset {
         vec![vec![0.01 * scale.full_scale]]
     }
 
+    fn idealised(&self) -> f64 {
+        0.0
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let offset = values[0];
         scene.signal.iter_mut().for_each(|value| *value += offset);

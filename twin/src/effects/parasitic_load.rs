@@ -11,7 +11,7 @@ pub struct ParasiticLoad;
 static CARD: Card = Card {
     id: "parasitic-load",
     statement: "A consumer draws current ahead of the sensor, which does not see it.",
-    equation: "dSoC/dt = −(i + load)/Q",
+    equation: "i + load in place of i: dSoC/dt = −(i + load)/Q",
     parameters: &[Parameter::new("load_a", "A", 0.0, Search::Linear)],
     shows: "state of charge falls at rest",
     looks_like: &["offset", "coulombic-efficiency"],
@@ -37,8 +37,7 @@ impl Effect for ParasiticLoad {
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
-        if let Some(battery) = &mut scene.battery {
-            battery.load_a = values[0];
-        }
+        // The cell's whole current: its voltage falls and its charge goes by it.
+        scene.signal.iter_mut().for_each(|i| *i += values[0]);
     }
 }

@@ -1,6 +1,6 @@
 //! RC branches after the ohmic step.
 
-use super::scene::{Scale, Scene, ladder};
+use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
@@ -77,7 +77,7 @@ impl Effect for Polarisation {
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
-        let drive = scene.drive;
+        let (drive, steps) = (scene.drive, scene.steps.clone());
         let Some(battery) = &mut scene.battery else {
             return;
         };
@@ -87,12 +87,12 @@ impl Effect for Polarisation {
             .zip(&battery.factor)
             .map(|(i, factor)| i * factor)
             .collect();
-        let (t_s, segments) = (&drive.t_s, &drive.segments);
+        let segments = &drive.segments;
         let v = match *values {
-            [r1, tau1] => ladder(t_s, segments, &driven, [tau1], [r1]),
-            [r1, tau1, r2, tau2] => ladder(t_s, segments, &driven, [tau1, tau2], [r1, r2]),
+            [r1, tau1] => steps.ladder(segments, &driven, [tau1], [r1]),
+            [r1, tau1, r2, tau2] => steps.ladder(segments, &driven, [tau1, tau2], [r1, r2]),
             [r1, tau1, r2, tau2, r3, tau3] => {
-                ladder(t_s, segments, &driven, [tau1, tau2, tau3], [r1, r2, r3])
+                steps.ladder(segments, &driven, [tau1, tau2, tau3], [r1, r2, r3])
             }
             _ => return,
         };

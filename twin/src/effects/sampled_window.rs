@@ -1,6 +1,6 @@
 //! Only a part of each period is measured.
 
-use super::scene::{Cursor, Scale, Scene, integral};
+use super::scene::{Cursor, Scale, Scene, floored, integral};
 use crate::spectrum;
 
 use super::{Card, Clues, Effect, Parameter, Search, Stage};
@@ -77,24 +77,31 @@ impl Effect for SampledWindow {
         let mut output = scene.signal.clone();
         for rows in drive.segments.iter().filter(|rows| !rows.is_empty()) {
             let start = drive.t_s[rows.start] + phase;
-            let mut cursor = Cursor::new(&drive.t_s, rows.clone());
-            let (mut known, mut mean) = (f64::NAN, 0.0);
-            for row in rows.clone() {
-                let elapsed = drive.t_s[row] - start;
-                // The newest window that has ended.
-                let ended = ((elapsed - duty * period) / period).floor();
-                if ended < 0.0 {
-                    output[row] = scene.signal[rows.start];
-                    continue;
+            // Windows go forward: one cursor for where they begin, one for where they end.
+            let mut begin = Cursor::new(&drive.t_s, rows.clone());
+            let mut end = begin.clone();
+            let (mut value, mut until) = (scene.signal[rows.start], f64::NEG_INFINITY);
+            let mut known = f64::NAN;
+            for (out, t) in output[rows.clone()]
+                .iter_mut()
+                .zip(&drive.t_s[rows.clone()])
+            {
+                let elapsed = t - start;
+                // Well before the next window ends there is nothing to ask.
+                if elapsed.is_nan() || elapsed >= until {
+                    // The newest window that has ended.
+                    let ended = floored((elapsed - duty * period) / period);
+                    until = (ended + 1.0 - 1e-6) * period + duty * period;
+                    if ended >= 0.0 && ended != known {
+                        known = ended;
+                        let from = start + ended * period;
+                        let before = begin.integral(&total, &scene.signal, from, held);
+                        let to = from + duty * period;
+                        let after = end.integral(&total, &scene.signal, to, held);
+                        value = (after - before) / (duty * period);
+                    }
                 }
-                if ended != known {
-                    known = ended;
-                    let from = start + ended * period;
-                    let before = cursor.integral(&total, &scene.signal, from, held);
-                    let after = cursor.integral(&total, &scene.signal, from + duty * period, held);
-                    mean = (after - before) / (duty * period);
-                }
-                output[row] = mean;
+                *out = value;
             }
         }
         scene.signal = output;

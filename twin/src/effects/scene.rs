@@ -1,6 +1,8 @@
 //! The simulation while effects act on it: series on the drive's rows, then on the observation's.
 
-use std::ops::Range;
+use std::collections::HashMap;
+use std::ops::{Deref, DerefMut, Range};
+use std::sync::Arc;
 
 use crate::problem::{Base, BatteryBase, Drive, Observed, Problem, SensorBase, View};
 
@@ -9,7 +11,7 @@ pub const REFERENCE_C: f64 = 25.0;
 /// 0 °C in K.
 pub const ZERO_CELSIUS_K: f64 = 273.15;
 
-/// Steps whose exponentials are kept.
+/// Kinds of step that are remembered while steps are told apart.
 const KNOWN: usize = 16;
 
 /// What sizes are natural in a problem: bounds and starts follow from it.
@@ -46,6 +48,8 @@ pub struct Scene<'a> {
     pub drive: &'a Drive,
     /// When readings were taken.
     pub observed: &'a Observed,
+    /// Steps of the drive's rows.
+    pub steps: Arc<Steps>,
     /// The signal: on drive rows before [`super::Stage::Output`], then on the observation's rows.
     pub signal: Vec<f64>,
     /// Transport delay in s.
@@ -58,6 +62,39 @@ pub struct Scene<'a> {
     pub battery: Option<Battery<'a>>,
 }
 
+/// A series that simulations share until one of them writes to it.
+#[derive(Clone, Debug, Default)]
+pub struct Series(Arc<Vec<f64>>);
+
+impl From<Vec<f64>> for Series {
+    fn from(values: Vec<f64>) -> Self {
+        Self(Arc::new(values))
+    }
+}
+
+impl Deref for Series {
+    type Target = [f64];
+
+    fn deref(&self) -> &[f64] {
+        &self.0
+    }
+}
+
+impl DerefMut for Series {
+    fn deref_mut(&mut self) -> &mut [f64] {
+        Arc::<Vec<f64>>::make_mut(&mut self.0)
+    }
+}
+
+impl<'s> IntoIterator for &'s Series {
+    type Item = &'s f64;
+    type IntoIter = std::slice::Iter<'s, f64>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.0.iter()
+    }
+}
+
 /// State of the battery simulation on drive rows; the scene's `signal` is the current in A.
 #[derive(Clone, Debug)]
 pub struct Battery<'a> {
@@ -67,118 +104,210 @@ pub struct Battery<'a> {
     pub capacity_ah: f64,
     /// Share of the charge put in that comes back.
     pub efficiency: f64,
-    /// A consumer that the current sensor does not see, in A.
-    pub load_a: f64,
     /// Added to the initial state of charge, 0 … 1.
     pub soc_shift: f64,
     /// Factor of the ohmic resistance by design.
     pub resistance: f64,
     /// State of charge, 0 … 1; filled between the stages of charge and temperature.
-    pub soc: Vec<f64>,
+    pub soc: Series,
+    /// Open-circuit voltage in V, from the state of charge.
+    open_circuit_v: Series,
     /// Temperature of the cell in °C.
-    pub temperature_c: Vec<f64>,
+    pub temperature_c: Series,
     /// Arrhenius temperature of the resistance in K, once known.
     pub arrhenius_k: Option<f64>,
     /// Factor on every resistance.
-    pub factor: Vec<f64>,
+    pub factor: Series,
     /// Voltage added to open circuit and ohmic drop, in V.
     pub added_v: Vec<f64>,
 }
 
-/// First-order low-pass by straight lines between samples, exact (the drive's rows may be irregular).
-///
-/// y(t+h) = e^(−h/τ)·y + (1 − e^(−h/τ))·u₀ + (u₁−u₀)·(1 − τ/h·(1 − e^(−h/τ)))
-pub fn low_pass(
-    t_s: &[f64],
-    segments: &[Range<usize>],
-    input: &[f64],
-    tau_s: f64,
-    held: bool,
-) -> Vec<f64> {
-    let mut output = input.to_vec();
-    if tau_s.is_nan() || tau_s <= 0.0 {
-        return output;
-    }
-    // Steps repeat, with some jitter: an exponential for each row would be most of the time.
-    let mut known = [(f64::NAN, 0.0, 0.0); KNOWN];
-    for rows in segments.iter().filter(|rows| !rows.is_empty()) {
-        let mut last = input[rows.start];
-        output[rows.start] = last;
-        for row in rows.start + 1..rows.end {
-            let h = t_s[row] - t_s[row - 1];
-            if h <= 0.0 {
-                output[row] = last;
-                continue;
-            }
-            // To a nanosecond: differences of times carry rounding.
-            let nanos = (h * 1e9).round();
-            let slot = &mut known[(nanos as u64 / 1_000_000) as usize % KNOWN];
-            if slot.0 != nanos {
-                let kept = (-h / tau_s).exp();
-                *slot = (nanos, kept, 1.0 - tau_s / h * (1.0 - kept));
-            }
-            let (_, kept, ramp) = *slot;
-            let from = input[row - 1];
-            let rise = if held { 0.0 } else { input[row] - from };
-            last = kept * last + (1.0 - kept) * from + rise * ramp;
-            output[row] = last;
-        }
-    }
-    output
+/// Steps between the drive's rows, told apart to a nanosecond (differences of times carry rounding). Steps repeat, with some
+/// jitter: a filter needs the exponential of each kind once, not of each row.
+#[derive(Clone, Debug, Default)]
+pub struct Steps {
+    /// Kind of the step that ends at each row; 0: no step.
+    kind: Vec<u32>,
+    /// Length of each kind in s.
+    length_s: Vec<f64>,
+    /// Length of every step of a segment, where they are all of one kind.
+    even_s: Vec<Option<f64>>,
 }
 
-/// A sum of first-order low-passes of one input, each with a weight, all at rest when a segment begins: one pass over the rows.
-pub fn ladder<const N: usize>(
-    t_s: &[f64],
-    segments: &[Range<usize>],
-    input: &[f64],
-    taus_s: [f64; N],
-    weights: [f64; N],
-) -> Vec<f64> {
-    let mut output = vec![0.0; input.len()];
-    let mut known = [(f64::NAN, [0.0; N], [0.0; N]); KNOWN];
-    for rows in segments.iter().filter(|rows| !rows.is_empty()) {
-        let mut last = [0.0; N];
-        for row in rows.start + 1..rows.end {
-            let h = t_s[row] - t_s[row - 1];
-            if h > 0.0 {
-                let nanos = (h * 1e9).round();
-                let slot = &mut known[(nanos as u64 / 1_000_000) as usize % KNOWN];
+impl Steps {
+    /// Of a drive's rows.
+    pub fn new(t_s: &[f64], segments: &[Range<usize>]) -> Self {
+        let mut kind = vec![0; t_s.len()];
+        let mut length_s = vec![0.0];
+        let mut numbers: HashMap<u64, u32> = HashMap::new();
+        let mut known = [(u64::MAX, 0u32); KNOWN];
+        for rows in segments.iter().filter(|rows| !rows.is_empty()) {
+            for row in rows.start + 1..rows.end {
+                let h = t_s[row] - t_s[row - 1];
+                if h.is_nan() || h <= 0.0 {
+                    continue;
+                }
+                let nanos = (h * 1e9).round() as u64;
+                let slot = &mut known[(nanos / 1_000_000) as usize % KNOWN];
                 if slot.0 != nanos {
-                    slot.0 = nanos;
-                    for (k, tau_s) in taus_s.iter().enumerate() {
-                        let kept = (-h / tau_s).exp();
-                        slot.1[k] = kept;
-                        slot.2[k] = 1.0 - tau_s / h * (1.0 - kept);
-                    }
+                    let number = *numbers.entry(nanos).or_insert_with(|| {
+                        length_s.push(h);
+                        length_s.len() as u32 - 1
+                    });
+                    *slot = (nanos, number);
                 }
-                let (from, rise) = (input[row - 1], input[row] - input[row - 1]);
-                for (k, last) in last.iter_mut().enumerate() {
-                    *last = slot.1[k] * (*last - from) + from + rise * slot.2[k];
-                }
+                kind[row] = slot.1;
             }
-            let mut sum = 0.0;
-            for k in 0..N {
-                sum += weights[k] * last[k];
-            }
-            output[row] = sum;
+        }
+        let even_s = segments
+            .iter()
+            .map(|rows| {
+                let kinds = kind.get(rows.start + 1..rows.end)?;
+                let first = *kinds.first().filter(|kind| **kind != 0)?;
+                let span_s = t_s[rows.end - 1] - t_s[rows.start];
+                kinds
+                    .iter()
+                    .all(|kind| *kind == first)
+                    .then_some(span_s / kinds.len() as f64)
+            })
+            .collect();
+        Self {
+            kind,
+            length_s,
+            even_s,
         }
     }
-    output
+
+    /// Weights of a first-order low-pass over each kind of step: of the last output, of the input where the step begins and of
+    /// that where it ends.
+    fn weights(&self, tau_s: f64, held: bool) -> impl Iterator<Item = [f64; 3]> + '_ {
+        self.length_s.iter().map(move |h| {
+            if *h <= 0.0 {
+                return [1.0, 0.0, 0.0];
+            }
+            let kept = (-h / tau_s).exp();
+            let ramp = if held {
+                0.0
+            } else {
+                1.0 - tau_s / h * (1.0 - kept)
+            };
+            [kept, 1.0 - kept - ramp, ramp]
+        })
+    }
+
+    /// First-order low-pass by straight lines between samples, exact (the drive's rows may be irregular).
+    ///
+    /// y(t+h) = e^(−h/τ)·y + (1 − e^(−h/τ))·u₀ + (u₁−u₀)·(1 − τ/h·(1 − e^(−h/τ)))
+    pub fn low_pass(
+        &self,
+        segments: &[Range<usize>],
+        input: &[f64],
+        tau_s: f64,
+        held: bool,
+    ) -> Vec<f64> {
+        let mut output = input.to_vec();
+        if tau_s.is_nan() || tau_s <= 0.0 {
+            return output;
+        }
+        let weights: Vec<[f64; 3]> = self.weights(tau_s, held).collect();
+        for (index, rows) in segments.iter().enumerate() {
+            let Some(mut last) = input[rows.clone()].first().copied() else {
+                continue;
+            };
+            let after = rows.start + 1..rows.end;
+            let input = &input[rows.clone()];
+            let output = &mut output[after.clone()];
+            let kinds = &self.kind[after];
+            // Each row waits for the one before it: of even steps four are made from one.
+            let fours = if self.even_s[index].is_some() {
+                output.len() / 4
+            } else {
+                0
+            };
+            let (even, output) = output.split_at_mut(4 * fours);
+            if let Some(kind) = kinds.first().filter(|_| fours > 0) {
+                let [kept, from, to] = weights[*kind as usize];
+                let powers = [kept, kept.powi(2), kept.powi(3), kept.powi(4)];
+                let inputs = input.windows(5).step_by(4);
+                for (out, x) in even.as_chunks_mut::<4>().0.iter_mut().zip(inputs) {
+                    let mut parts = [0.0; 4];
+                    let mut part = 0.0;
+                    for k in 0..4 {
+                        part = kept * part + (from * x[k] + to * x[k + 1]);
+                        parts[k] = part;
+                    }
+                    for k in 0..4 {
+                        out[k] = parts[k] + powers[k] * last;
+                    }
+                    last = out[3];
+                }
+            }
+            let left = input[4 * fours..].windows(2);
+            for ((pair, out), kind) in left.zip(output).zip(&kinds[4 * fours..]) {
+                let [kept, from, to] = weights[*kind as usize];
+                last = kept * last + (from * pair[0] + to * pair[1]);
+                *out = last;
+            }
+        }
+        output
+    }
+
+    /// A sum of first-order low-passes of one input, each with a weight, all at rest when a segment begins: one pass over the
+    /// rows.
+    pub fn ladder<const N: usize>(
+        &self,
+        segments: &[Range<usize>],
+        input: &[f64],
+        taus_s: [f64; N],
+        weights: [f64; N],
+    ) -> Vec<f64> {
+        let mut output = vec![0.0; input.len()];
+        let mut of_kind = vec![[[0.0; N]; 3]; self.length_s.len()];
+        for k in 0..N {
+            for (all, [kept, from, to]) in of_kind.iter_mut().zip(self.weights(taus_s[k], false)) {
+                all[0][k] = kept;
+                all[1][k] = weights[k] * from;
+                all[2][k] = weights[k] * to;
+            }
+        }
+        for rows in segments.iter().filter(|rows| !rows.is_empty()) {
+            let mut last = [0.0; N];
+            let after = rows.start + 1..rows.end;
+            let pairs = input[rows.clone()].windows(2);
+            for ((pair, out), kind) in pairs.zip(&mut output[after.clone()]).zip(&self.kind[after])
+            {
+                let [kept, from, to] = &of_kind[*kind as usize];
+                let mut sum = 0.0;
+                for k in 0..N {
+                    last[k] = kept[k] * last[k] + (from[k] * pair[0] + to[k] * pair[1]);
+                    sum += last[k];
+                }
+                *out = sum;
+            }
+        }
+        output
+    }
 }
 
 /// Integral over time from the start of each segment: trapezoids, or the last value held.
 pub fn integral(t_s: &[f64], segments: &[Range<usize>], input: &[f64], held: bool) -> Vec<f64> {
     let mut output = vec![0.0; input.len()];
-    for rows in segments {
-        for row in rows.clone().skip(1) {
-            let h = t_s[row] - t_s[row - 1];
+    for rows in segments.iter().filter(|rows| !rows.is_empty()) {
+        let mut sum = 0.0;
+        let steps = t_s[rows.clone()].windows(2);
+        let pairs = input[rows.clone()].windows(2);
+        for ((out, times), pair) in output[rows.start + 1..rows.end]
+            .iter_mut()
+            .zip(steps)
+            .zip(pairs)
+        {
             let mean = if held {
-                input[row - 1]
+                pair[0]
             } else {
-                0.5 * (input[row] + input[row - 1])
+                0.5 * (pair[1] + pair[0])
             };
-            output[row] = output[row - 1] + mean * h;
+            sum += mean * (times[1] - times[0]);
+            *out = sum;
         }
     }
     output
@@ -202,7 +331,8 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Moves so that `at` is the last row not after `t`; false if `t` is outside by more than `slack_s`.
+    /// Moves so that `at` is the last row not after `t`.
+    #[inline]
     fn seek(&mut self, t: f64) {
         while self.at > self.rows.start && self.t_s[self.at] > t {
             self.at -= 1;
@@ -213,6 +343,7 @@ impl<'a> Cursor<'a> {
     }
 
     /// Value at a time: straight lines, or the last value held; the first and last value beyond the ends.
+    #[inline]
     pub fn value(&mut self, series: &[f64], t: f64, held: bool) -> f64 {
         self.seek(t);
         let at = self.at;
@@ -225,6 +356,7 @@ impl<'a> Cursor<'a> {
     }
 
     /// Integral (as [`integral`] gives it at rows) at a time; beyond the ends the signal holds its end values.
+    #[inline]
     pub fn integral(&mut self, integral: &[f64], series: &[f64], t: f64, held: bool) -> f64 {
         self.seek(t);
         let at = self.at;
@@ -256,13 +388,80 @@ pub fn boxcar(
     }
     let total = integral(t_s, segments, input, held);
     for rows in segments {
-        let mut back = Cursor::new(t_s, rows.clone());
-        for row in rows.clone() {
-            let start = back.integral(&total, input, t_s[row] - window_s, held);
-            output[row] = (total[row] - start) / window_s;
+        let (t, x, total) = (
+            &t_s[rows.clone()],
+            &input[rows.clone()],
+            &total[rows.clone()],
+        );
+        // The row that the window begins after: times go forward within a segment.
+        let mut at = 0;
+        for ((out, now), until) in output[rows.clone()].iter_mut().zip(t).zip(total) {
+            let begin = now - window_s;
+            while at + 1 < t.len() && t[at + 1] <= begin {
+                at += 1;
+            }
+            let h = begin - t[at];
+            let start = if h <= 0.0 || held || at + 1 >= t.len() {
+                total[at] + x[at] * h
+            } else {
+                let end = x[at] + (x[at + 1] - x[at]) * (h / (t[at + 1] - t[at]));
+                total[at] + 0.5 * (x[at] + end) * h
+            };
+            *out = (until - start) / window_s;
         }
     }
     output
+}
+
+/// A series of even steps, later by some steps; straight lines between rows, the first and last value beyond the ends.
+fn moved(series: &[f64], steps: f64, out: &mut [f64]) {
+    let (Some(first), Some(last)) = (series.first(), series.last()) else {
+        return;
+    };
+    let count = series.len() as isize;
+    let whole = steps.floor().clamp(-count as f64, count as f64);
+    let share = 1.0 - (steps - whole).clamp(0.0, 1.0);
+    let whole = whole as isize;
+    let begin = (whole + 1).clamp(0, count) as usize;
+    let end = (count + whole).clamp(begin as isize, count) as usize;
+    out[..begin].fill(*first);
+    out[end..].fill(*last);
+    let pairs = series
+        .get((begin as isize - whole - 1).max(0) as usize..)
+        .unwrap_or_default()
+        .windows(2);
+    for (out, pair) in out[begin..end].iter_mut().zip(pairs) {
+        *out = pair[0] + (pair[1] - pair[0]) * share;
+    }
+}
+
+/// A series of even steps at another rate, and later by some steps.
+fn stretched(series: &[f64], rate: f64, steps: f64, out: &mut [f64]) {
+    let (Some(first), Some(last)) = (series.first(), series.last()) else {
+        return;
+    };
+    for (row, out) in out.iter_mut().enumerate() {
+        let at = row as f64 * rate - steps;
+        let whole = at as usize;
+        *out = match (series.get(whole), series.get(whole + 1)) {
+            (Some(here), Some(next)) if at > 0.0 => here + (next - here) * (at - whole as f64),
+            (Some(_), _) if at <= 0.0 => *first,
+            _ => *last,
+        };
+    }
+}
+
+/// [`f64::round`] of what is less than 2⁵² in size, without a call.
+pub fn rounded(value: f64) -> f64 {
+    /// The largest number below a half.
+    const HALF: f64 = 0.499_999_999_999_999_94;
+    (value + HALF.copysign(value)) as i64 as f64
+}
+
+/// [`f64::floor`] of what is less than 2⁵² in size, without a call.
+pub fn floored(value: f64) -> f64 {
+    let whole = value as i64 as f64;
+    if whole > value { whole - 1.0 } else { whole }
 }
 
 impl<'a> Scene<'a> {
@@ -276,6 +475,7 @@ impl<'a> Scene<'a> {
         Self {
             drive,
             observed: &problem.observed,
+            steps: Arc::new(Steps::new(&drive.t_s, &drive.segments)),
             signal: drive.reference.clone(),
             delay_s: 0.0,
             skew: 0.0,
@@ -291,13 +491,8 @@ impl<'a> Scene<'a> {
 
     /// First-order low-pass of the scene's own signal.
     pub fn low_pass(&self, input: &[f64], tau_s: f64) -> Vec<f64> {
-        low_pass(
-            &self.drive.t_s,
-            &self.drive.segments,
-            input,
-            tau_s,
-            self.held(),
-        )
+        self.steps
+            .low_pass(&self.drive.segments, input, tau_s, self.held())
     }
 
     /// From drive rows to the observation's rows.
@@ -312,35 +507,60 @@ impl<'a> Scene<'a> {
         let total = (view == View::Charge)
             .then(|| integral(&drive.t_s, &drive.segments, &self.signal, held));
         let mut sampled = vec![f64::NAN; observed.t_s.len()];
-        let mut current: Option<(usize, Cursor<'_>)> = None;
-        let mut last: Option<(f64, f64)> = None;
-        for (row, value) in sampled.iter_mut().enumerate() {
-            let segment = observed.segment[row];
-            let Some(rows) = drive.segments.get(segment).filter(|rows| !rows.is_empty()) else {
-                continue;
-            };
-            if current.as_ref().is_none_or(|(known, _)| *known != segment) {
-                current = Some((segment, Cursor::new(&drive.t_s, rows.clone())));
-                last = None;
-            }
-            let Some((_, cursor)) = &mut current else {
+        let (skew, delay_s) = (1.0 + self.skew, self.delay_s);
+        let mut from = 0;
+        let mut known: (usize, Option<(f64, f64)>) = (usize::MAX, None);
+        // One stretch of readings after the other, each within one segment.
+        for readings in observed.segment.chunk_by(|a, b| a == b) {
+            let these = from..from + readings.len();
+            from = these.end;
+            let rows = drive.segments.get(readings[0]).cloned();
+            let Some(rows) = rows.filter(|rows| !rows.is_empty()) else {
                 continue;
             };
             let start = drive.t_s[rows.start];
+            // Rows of even steps: all of them move by the same part of a step.
+            let even_rows = if observed.on_drive_rows && !held && total.is_none() {
+                (rows.start, rows.end)
+            } else {
+                (0, 0)
+            };
+            let mut cursor = Cursor::new(&drive.t_s, rows);
+            let times = &observed.t_s[these.clone()];
+            let values = &mut sampled[these.clone()];
+            if let Some(Some(step_s)) = self.steps.even_s.get(readings[0])
+                && (these.start, these.end) == even_rows
+            {
+                let steps = delay_s / step_s;
+                if skew == 1.0 {
+                    moved(&self.signal[these], steps, values);
+                } else {
+                    stretched(&self.signal[these], 1.0 / skew, steps, values);
+                }
+                continue;
+            }
             // What the sensor's clock calls t was at this time.
-            let t = start + (observed.t_s[row] - start) / (1.0 + self.skew) - self.delay_s;
-            match &total {
-                None => *value = cursor.value(&self.signal, t, held),
-                Some(total) => {
-                    let charge = cursor.integral(total, &self.signal, t, held);
-                    if let Some((before_t, before)) = last
-                        && t > before_t
-                    {
-                        *value = (charge - before) / (t - before_t);
-                    }
-                    if observed.valid[row] || last.is_none() {
-                        last = Some((t, charge));
-                    }
+            let reference_s = |t: f64| start + (t - start) / skew - delay_s;
+            let Some(total) = &total else {
+                for (value, t) in values.iter_mut().zip(times) {
+                    *value = cursor.value(&self.signal, reference_s(*t), held);
+                }
+                continue;
+            };
+            if known.0 != readings[0] {
+                known = (readings[0], None);
+            }
+            let last = &mut known.1;
+            for ((value, t), valid) in values.iter_mut().zip(times).zip(&observed.valid[these]) {
+                let t = reference_s(*t);
+                let charge = cursor.integral(total, &self.signal, t, held);
+                if let Some((before_t, before)) = *last
+                    && t > before_t
+                {
+                    *value = (charge - before) / (t - before_t);
+                }
+                if *valid || last.is_none() {
+                    *last = Some((t, charge));
                 }
             }
         }
@@ -364,13 +584,13 @@ impl<'a> Battery<'a> {
             } else {
                 1.0
             },
-            load_a: 0.0,
             soc_shift: 0.0,
             resistance: 1.0,
-            soc: Vec::new(),
-            temperature_c,
+            soc: Series::default(),
+            open_circuit_v: Series::default(),
+            temperature_c: temperature_c.into(),
             arrhenius_k: None,
-            factor: vec![1.0; rows],
+            factor: vec![1.0; rows].into(),
             added_v: vec![0.0; rows],
         }
     }
@@ -380,7 +600,6 @@ impl<'a> Battery<'a> {
         let mut soc = vec![0.0; drive.len()];
         let per_as = 1.0 / (3600.0 * self.capacity_ah);
         let flow = |current: f64| {
-            let current = current + self.load_a;
             if current < 0.0 {
                 current * self.efficiency
             } else {
@@ -395,57 +614,85 @@ impl<'a> Battery<'a> {
         {
             let first = self.base.initial_soc.get(index).copied().unwrap_or(1.0) + self.soc_shift;
             soc[rows.start] = first;
-            for row in rows.clone().skip(1) {
-                let h = drive.t_s[row] - drive.t_s[row - 1];
-                let mean = 0.5 * (flow(current_a[row]) + flow(current_a[row - 1]));
-                soc[row] = soc[row - 1] - mean * h * per_as;
+            let (mut last, mut before) = (first, flow(current_a[rows.start]));
+            let after = rows.start + 1..rows.end;
+            let steps = drive.t_s[rows.clone()].windows(2);
+            for ((soc, current), times) in soc[after.clone()]
+                .iter_mut()
+                .zip(&current_a[after])
+                .zip(steps)
+            {
+                let here = flow(*current);
+                let mean = 0.5 * (here + before);
+                last -= mean * (times[1] - times[0]) * per_as;
+                (*soc, before) = (last, here);
             }
         }
-        self.soc = soc;
+        self.soc = soc.into();
+    }
+
+    /// Looks up the open-circuit voltage: after the charge is counted.
+    pub fn open_circuit(&mut self) {
+        self.open_circuit_v = open_circuit_v(&self.base.ocv, &self.soc).into();
     }
 
     /// What temperature does to the resistance: after the stage of temperature.
     pub fn warm(&mut self) {
         if let Some(b_k) = self.arrhenius_k {
             for (factor, t) in self.factor.iter_mut().zip(&self.temperature_c) {
-                let inverse = 1.0 / (t + ZERO_CELSIUS_K) - 1.0 / (REFERENCE_C + ZERO_CELSIUS_K);
-                *factor *= (b_k * inverse).exp();
+                *factor *= arrhenius(b_k, *t);
             }
         }
     }
 
-    /// The voltage from everything: open circuit, ohmic drop and what was added.
-    pub fn voltage(&self, current_a: &[f64]) -> Vec<f64> {
+    /// The voltage from everything, in place of the current: open circuit, ohmic drop and what was added.
+    pub fn voltage(&self, signal: &mut [f64]) {
         let ohms = self.base.resistance_ohm * self.resistance;
-        let table = &self.base.ocv;
-        let mut at = 0;
-        self.soc
-            .iter()
-            .enumerate()
-            .map(|(row, soc)| {
-                open_circuit_v(table, *soc, &mut at) - ohms * self.factor[row] * current_a[row]
-                    + self.added_v[row]
-            })
-            .collect()
+        for (((value, open_v), factor), added_v) in signal
+            .iter_mut()
+            .zip(&self.open_circuit_v)
+            .zip(&self.factor)
+            .zip(&self.added_v)
+        {
+            *value = open_v - ohms * factor * *value + added_v;
+        }
     }
 }
 
-/// Straight lines between the points of the table and beyond its ends; `at` is where the last look-up ended.
-fn open_circuit_v(table: &[(f64, f64)], soc: f64, at: &mut usize) -> f64 {
+/// Factor of a resistance of Arrhenius temperature `b_k`, in K, from 25 °C to a temperature.
+pub fn arrhenius(b_k: f64, temperature_c: f64) -> f64 {
+    let inverse = 1.0 / (temperature_c + ZERO_CELSIUS_K) - 1.0 / (REFERENCE_C + ZERO_CELSIUS_K);
+    (b_k * inverse).exp()
+}
+
+/// Straight lines between the points of the table and beyond its ends.
+fn open_circuit_v(table: &[(f64, f64)], soc: &[f64]) -> Vec<f64> {
     match table {
-        [] => 0.0,
-        [only] => only.1,
+        [] => vec![0.0; soc.len()],
+        [only] => vec![only.1; soc.len()],
         _ => {
             let last = table.len() - 2;
-            *at = (*at).min(last);
-            while *at > 0 && table[*at].0 > soc {
-                *at -= 1;
-            }
-            while *at < last && table[*at + 1].0 <= soc {
-                *at += 1;
-            }
-            let (from, to) = (table[*at], table[*at + 1]);
-            from.1 + (to.1 - from.1) * (soc - from.0) / (to.0 - from.0)
+            // The line in use, and where it ends.
+            let (mut at, mut low, mut high) = (0, f64::INFINITY, f64::NEG_INFINITY);
+            let (mut from, mut slope) = (table[0], 0.0);
+            soc.iter()
+                .map(|&soc| {
+                    if !(low <= soc && soc < high) {
+                        while at > 0 && table[at].0 > soc {
+                            at -= 1;
+                        }
+                        while at < last && table[at + 1].0 <= soc {
+                            at += 1;
+                        }
+                        let to = table[at + 1];
+                        from = table[at];
+                        slope = (to.1 - from.1) / (to.0 - from.0);
+                        low = if at == 0 { f64::NEG_INFINITY } else { from.0 };
+                        high = if at == last { f64::INFINITY } else { to.0 };
+                    }
+                    from.1 + slope * (soc - from.0)
+                })
+                .collect()
         }
     }
 }
@@ -458,7 +705,7 @@ mod tests {
     #[test]
     fn a_low_pass_follows_a_ramp_late_by_tau() {
         let t_s: Vec<f64> = (0..2000).map(|k| f64::from(k) * 0.01).collect();
-        let output = low_pass(&t_s, &[0..2000], &t_s, 0.5, false);
+        let output = Steps::new(&t_s, &[0..2000]).low_pass(&[0..2000], &t_s, 0.5, false);
         assert!((output[1999] - (t_s[1999] - 0.5)).abs() < 1e-9);
     }
 
@@ -470,11 +717,55 @@ mod tests {
     }
 
     #[test]
+    fn a_series_of_even_steps_moves_as_any_other() {
+        let t_s: Vec<f64> = (0..50).map(|k| f64::from(k) * 0.1).collect();
+        let series: Vec<f64> = t_s.iter().map(|t| (7.0 * t).sin()).collect();
+        for steps in [
+            -60.0, -50.0, -49.5, -7.0, -1.3, -0.2, 0.0, 0.4, 1.0, 2.6, 48.9, 49.0, 50.0, 70.2,
+        ] {
+            for rate in [1.0, 0.8, 1.1] {
+                let mut out = vec![f64::NAN; 50];
+                if rate == 1.0 {
+                    moved(&series, steps, &mut out);
+                } else {
+                    stretched(&series, rate, steps, &mut out);
+                }
+                let mut cursor = Cursor::new(&t_s, 0..50);
+                for (out, t) in out.iter().zip(&t_s) {
+                    let there = cursor.value(&series, rate * t - 0.1 * steps, false);
+                    assert!((out - there).abs() < 1e-9, "{steps} {rate} {t}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn rounding_without_a_call_is_the_same() {
+        for value in [
+            0.0,
+            0.5,
+            1.5,
+            2.5,
+            0.499_999_999_999_999_94,
+            1e9 + 0.5,
+            3.0,
+            3.2,
+            3.7,
+            1e15 + 0.5,
+        ] {
+            for value in [value, -value] {
+                assert_eq!(rounded(value), value.round());
+                assert_eq!(floored(value), value.floor());
+            }
+        }
+    }
+
+    #[test]
     fn a_low_pass_of_a_step_is_the_exponential() {
         let t_s: Vec<f64> = (0..100).map(|k| f64::from(k) * 0.1).collect();
         let mut step = vec![1.0; 100];
         step[0] = 0.0;
-        let held = low_pass(&t_s, &[0..100], &step, 2.0, true);
+        let held = Steps::new(&t_s, &[0..100]).low_pass(&[0..100], &step, 2.0, true);
         // The held 0 lasts until the second row.
         assert!((held[41] - (1.0 - (-4.0f64 / 2.0).exp())).abs() < 1e-9);
     }

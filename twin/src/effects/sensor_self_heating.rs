@@ -3,6 +3,9 @@
 use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 
+/// Heat needs a second at least to reach a Hall element through its package.
+const MIN_TAU_S: f64 = 1.0;
+
 /// See [`CARD`].
 #[derive(Debug)]
 pub struct SensorSelfHeating;
@@ -31,13 +34,15 @@ impl Effect for SensorSelfHeating {
             let most = 0.5 / (scale.rms * scale.rms).max(1e-12);
             (-most, most)
         } else {
-            (2.0 * scale.step_s, 2.0 * scale.span_s)
+            // What is quicker is no heat.
+            ((10.0 * scale.step_s).max(MIN_TAU_S), 2.0 * scale.span_s)
         }
     }
 
     fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
         let small = 0.01 / (scale.rms * scale.rms).max(1e-12);
-        spaced(5.0 * scale.step_s, 0.5 * scale.span_s, 6)
+        let quickest = (20.0 * scale.step_s).max(2.0 * MIN_TAU_S);
+        spaced(quickest, (0.5 * scale.span_s).max(2.0 * quickest), 6)
             .into_iter()
             .map(|tau| vec![small, tau])
             .collect()

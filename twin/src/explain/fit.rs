@@ -1,19 +1,27 @@
 //! Robust least squares for the values of a model: Levenberg–Marquardt on Huber's loss, bounds kept, steps searched.
 
-use nalgebra::{DMatrix, DVector};
+use std::sync::{Arc, OnceLock};
+
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
 use super::workbench::{Model, Workbench};
 use crate::effects::Search;
+use crate::effects::chain::Change;
 use crate::problem::Base;
 
 /// Residuals beyond this many standard deviations count by their size, not by its square (Huber).
 pub const TUNING: f64 = 3.0;
+/// Sums that are kept side by side.
+const LANES: usize = 8;
 /// Steps of Levenberg–Marquardt in one go.
 const STEPS: usize = 14;
 /// A step that lowers the loss by a smaller share calls for a new slope.
 const SLOW: f64 = 5e-3;
 /// A step with a new slope that lowers the loss by a smaller share is the last.
 const ENOUGH: f64 = 1e-4;
+
+/// A fit of more rows than this does not keep its slope: memory stays linear in the recording, with a small factor.
+const KEPT_ROWS: usize = 40_000;
 
 /// A fitted model.
 #[derive(Clone, Debug)]
@@ -28,6 +36,32 @@ pub struct Fit {
     pub sigma: f64,
     /// Huber's loss over the rows fitted, in units of sigma².
     pub cost: f64,
+    slope: Arc<OnceLock<Arc<Slope>>>,
+}
+
+impl Fit {
+    /// A model as it is, with the simulation of it.
+    pub fn of(bench: &Workbench<'_>, model: Model, cost: f64) -> Self {
+        let predicted = bench.run(&model);
+        let residual = bench.residual(&predicted);
+        Self {
+            sigma: spread(&residual),
+            model,
+            predicted,
+            residual,
+            cost,
+            slope: Arc::default(),
+        }
+    }
+
+    /// The slope at its model: found once.
+    pub fn slope(&self, bench: &Workbench<'_>) -> Arc<Slope> {
+        let new = || Arc::new(slope(bench, &self.model, &self.predicted));
+        if bench.len() > KEPT_ROWS {
+            return new();
+        }
+        Arc::clone(self.slope.get_or_init(new))
+    }
 }
 
 /// Which values are free, as coordinates of either sign and no bounds to speak of.
@@ -38,6 +72,18 @@ enum Coordinate {
     SocShift,
     Resistance,
     Alignment,
+}
+
+impl Coordinate {
+    /// Where in the simulation it begins to tell.
+    fn change(self) -> Change {
+        match self {
+            Self::Value(member, _, _) => Change::Member(member),
+            Self::SocShift => Change::SocShift,
+            Self::Resistance => Change::Resistance,
+            Self::Alignment => Change::Alignment,
+        }
+    }
 }
 
 /// Spread by the median of absolute values, kept from vanishing where most residuals are nothing.
@@ -55,16 +101,33 @@ pub fn spread(residual: &[f64]) -> f64 {
 /// Huber's loss of a residual in units of sigma.
 pub fn huber(z: f64) -> f64 {
     let size = z.abs();
-    if size <= TUNING {
-        0.5 * z * z
-    } else {
-        TUNING * (size - 0.5 * TUNING)
-    }
+    // The part of it that counts by its square.
+    let inner = size.min(TUNING);
+    inner * (size - 0.5 * inner)
 }
 
 fn weight(z: f64) -> f64 {
-    let size = z.abs();
-    if size <= TUNING { 1.0 } else { TUNING / size }
+    TUNING / z.abs().max(TUNING)
+}
+
+/// Sum of what a function makes of two series, in lanes.
+fn sum_of(a: &[f64], b: &[f64], part: impl Fn(f64, f64) -> f64) -> f64 {
+    let (a_chunks, a_rest) = a.as_chunks::<LANES>();
+    let (b_chunks, b_rest) = b.as_chunks::<LANES>();
+    let mut lanes = [0.0; LANES];
+    for (x, y) in a_chunks.iter().zip(b_chunks) {
+        for lane in 0..LANES {
+            lanes[lane] += part(x[lane], y[lane]);
+        }
+    }
+    let rest: f64 = a_rest.iter().zip(b_rest).map(|(x, y)| part(*x, *y)).sum();
+    lanes.iter().sum::<f64>() + rest
+}
+
+/// Huber's loss of residuals.
+pub fn loss(residual: &[f64], sigma: f64) -> f64 {
+    let per_sigma = 1.0 / sigma;
+    sum_of(residual, residual, |r, _| huber(r * per_sigma))
 }
 
 /// Derivatives of the simulation by each free coordinate, at the rows that count.
@@ -274,32 +337,45 @@ fn step_of(bench: &Workbench<'_>, unit: &str, value: f64, low: f64, high: f64) -
 }
 
 /// The slope at a model.
-pub fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
+fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
     let mut slope = Slope {
         coordinates: Vec::new(),
         columns: Vec::new(),
         prior: Vec::new(),
         at: Vec::new(),
     };
-    for (coordinate, step, prior, at) in coordinates(bench, model) {
-        let column = |sign: f64| -> Option<Vec<f64>> {
-            let mut moved = model.clone();
-            shift(bench, &mut moved, coordinate, sign * step);
-            let there = bench.run(&moved);
+    let coordinates = coordinates(bench, model);
+    let mut columns: Vec<Option<Vec<f64>>> = vec![None; coordinates.len()];
+    // At a bound the step goes the other way.
+    for sign in [1.0, -1.0] {
+        let missing: Vec<usize> = (0..columns.len())
+            .filter(|k| columns[*k].is_none())
+            .collect();
+        if missing.is_empty() {
+            break;
+        }
+        let moved: Vec<(Change, Model)> = missing
+            .iter()
+            .map(|k| {
+                let (coordinate, step, _, _) = coordinates[*k];
+                let mut moved = model.clone();
+                shift(bench, &mut moved, coordinate, sign * step);
+                (coordinate.change(), moved)
+            })
+            .collect();
+        for (k, mut column) in missing.into_iter().zip(bench.vary(model, &moved)) {
+            let per_step = sign / coordinates[k].1;
             let mut any = false;
-            let column: Vec<f64> = there
-                .iter()
-                .zip(predicted)
-                .map(|(there, here)| {
-                    let slope = sign * (there - here) / step;
-                    any |= slope != 0.0;
-                    if slope.is_finite() { slope } else { 0.0 }
-                })
-                .collect();
-            any.then_some(column)
-        };
-        // At a bound the step goes the other way.
-        if let Some(column) = column(1.0).or_else(|| column(-1.0)) {
+            for (there, here) in column.iter_mut().zip(predicted) {
+                let slope = (*there - here) * per_step;
+                any |= slope != 0.0;
+                *there = if slope.is_finite() { slope } else { 0.0 };
+            }
+            columns[k] = any.then_some(column);
+        }
+    }
+    for ((coordinate, _, prior, at), column) in coordinates.into_iter().zip(columns) {
+        if let Some(column) = column {
             slope.coordinates.push(coordinate);
             slope.columns.push(column);
             slope.prior.push(prior);
@@ -337,52 +413,65 @@ pub fn normal(
 
 /// Sum of products, in lanes.
 pub fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let mut lanes = [0.0f64; 8];
-    let (a_chunks, b_chunks) = (a.chunks_exact(8), b.chunks_exact(8));
-    let rest: f64 = a_chunks
-        .remainder()
-        .iter()
-        .zip(b_chunks.remainder())
-        .map(|(x, y)| x * y)
-        .sum();
-    for (x, y) in a_chunks.zip(b_chunks) {
-        for lane in 0..8 {
-            lanes[lane] += x[lane] * y[lane];
+    sum_of(a, b, |x, y| x * y)
+}
+
+/// A normal matrix made ready to be solved, with a little damping, scaled by the diagonal.
+#[derive(Clone, Debug)]
+pub struct Solver {
+    scale: Vec<f64>,
+    factor: Option<Cholesky<f64, Dyn>>,
+}
+
+impl Solver {
+    /// Of a matrix.
+    pub fn new(matrix: &DMatrix<f64>, damping: f64) -> Self {
+        let size = matrix.nrows();
+        let scale: Vec<f64> = (0..size)
+            .map(|k| {
+                let d = matrix[(k, k)];
+                if d > 0.0 { d.sqrt() } else { 1.0 }
+            })
+            .collect();
+        let mut scaled = DMatrix::zeros(size, size);
+        for a in 0..size {
+            for b in 0..size {
+                scaled[(a, b)] = matrix[(a, b)] / (scale[a] * scale[b]);
+            }
+            scaled[(a, a)] += damping + 1e-12;
+            if matrix[(a, a)] <= 0.0 {
+                scaled[(a, a)] = 1.0;
+            }
+        }
+        Self {
+            scale,
+            factor: scaled.cholesky(),
         }
     }
-    lanes.iter().sum::<f64>() + rest
+
+    /// Puts the solution in place of the right side; zero where nothing is known.
+    pub fn solve(&self, right: &mut DVector<f64>) {
+        let Some(factor) = &self.factor else {
+            right.fill(0.0);
+            return;
+        };
+        for (value, scale) in right.iter_mut().zip(&self.scale) {
+            *value /= scale;
+        }
+        factor.solve_mut(right);
+        for (value, scale) in right.iter_mut().zip(&self.scale) {
+            *value /= scale;
+        }
+    }
 }
 
 /// Solves with a little damping, scaled by the diagonal; zero where nothing is known.
 pub fn solve(matrix: &DMatrix<f64>, right: &DVector<f64>, damping: f64) -> DVector<f64> {
-    let size = right.len();
-    if size == 0 {
-        return DVector::zeros(0);
+    let mut solved = right.clone();
+    if !solved.is_empty() {
+        Solver::new(matrix, damping).solve(&mut solved);
     }
-    let scale: Vec<f64> = (0..size)
-        .map(|k| {
-            let d = matrix[(k, k)];
-            if d > 0.0 { d.sqrt() } else { 1.0 }
-        })
-        .collect();
-    let mut scaled = DMatrix::zeros(size, size);
-    for a in 0..size {
-        for b in 0..size {
-            scaled[(a, b)] = matrix[(a, b)] / (scale[a] * scale[b]);
-        }
-        scaled[(a, a)] += damping + 1e-12;
-        if matrix[(a, a)] <= 0.0 {
-            scaled[(a, a)] = 1.0;
-        }
-    }
-    let right = DVector::from_fn(size, |k, _| right[k] / scale[k]);
-    match scaled.cholesky() {
-        Some(factor) => {
-            let solved = factor.solve(&right);
-            DVector::from_fn(size, |k, _| solved[k] / scale[k])
-        }
-        None => DVector::zeros(size),
-    }
+    solved
 }
 
 /// Huber's loss of the rows in use, and the penalty.
@@ -393,13 +482,10 @@ fn cost(
     sigma: f64,
     used: Option<&[f64]>,
 ) -> f64 {
-    let loss: f64 = match used {
-        None => residual.iter().map(|r| huber(r / sigma)).sum(),
-        Some(used) => residual
-            .iter()
-            .zip(used)
-            .map(|(r, use_it)| use_it * huber(r / sigma))
-            .sum(),
+    let per_sigma = 1.0 / sigma;
+    let loss = match used {
+        None => loss(residual, sigma),
+        Some(used) => sum_of(residual, used, |r, used| used * huber(r * per_sigma)),
     };
     let penalty: f64 = coordinates(bench, model)
         .iter()
@@ -410,6 +496,16 @@ fn cost(
 
 /// Fits every free value from where the model stands. `used` weighs rows (0: left out); sigma is found on the way.
 pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
+    // The same question is asked again and again, and fits have one answer.
+    if used.is_none()
+        && let Some((model, sigma, cost)) = bench.known(model)
+    {
+        return Fit {
+            sigma,
+            ..Fit::of(bench, model, cost)
+        };
+    }
+    let from = model;
     let mut model = model.clone();
     if !bench.aligns(&model) {
         model.nuisance.alignment_s = 0.0;
@@ -417,24 +513,27 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
     let mut predicted = bench.run(&model);
     let mut residual = bench.residual(&predicted);
     let mut sigma = spread(&residual);
+    let mut known = None;
     // The spread falls while the model becomes better: the loss follows in rounds.
     for _ in 0..3 {
         let before = sigma;
-        descend(
+        known = descend(
             bench,
             &mut model,
             &mut predicted,
             &mut residual,
             sigma,
             used,
+            known,
         );
-        search_steps(
+        known = search_steps(
             bench,
             &mut model,
             &mut predicted,
             &mut residual,
             sigma,
             used,
+            known,
         );
         sigma = spread(&residual);
         if sigma > 0.9 * before {
@@ -442,12 +541,22 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
         }
     }
     let cost = cost(bench, &model, &residual, sigma, used);
+    if used.is_none() {
+        bench.remember(from, &model, sigma, cost);
+    }
+    let slope = OnceLock::new();
+    if let Some(known) = known
+        && bench.len() <= KEPT_ROWS
+    {
+        let _ = slope.set(Arc::new(known));
+    }
     Fit {
         model,
         predicted,
         residual,
         sigma,
         cost,
+        slope: Arc::new(slope),
     }
 }
 
@@ -466,6 +575,7 @@ pub fn polish(bench: &Workbench<'_>, from: &Fit) -> Fit {
     best
 }
 
+/// Levenberg–Marquardt from a model whose slope may be known; gives the slope where it ends if that is known.
 fn descend(
     bench: &Workbench<'_>,
     model: &mut Model,
@@ -473,21 +583,26 @@ fn descend(
     residual: &mut Vec<f64>,
     sigma: f64,
     used: Option<&[f64]>,
-) {
+    known: Option<Slope>,
+) -> Option<Slope> {
     let mut damping = 1e-4;
     let mut here = cost(bench, model, residual, sigma, used);
-    let mut slope = slope(bench, model, predicted);
+    let mut slope = known.unwrap_or_else(|| slope(bench, model, predicted));
     let mut fresh = true;
     let mut steps = 0;
     while steps < STEPS && !slope.is_empty() {
         steps += 1;
-        let weights: Vec<f64> = residual
+        let (per_sigma, per_square) = (1.0 / sigma, 1.0 / (sigma * sigma));
+        let mut weights: Vec<f64> = residual
             .iter()
-            .enumerate()
-            .map(|(row, r)| {
-                weight(r / sigma) / (sigma * sigma) * used.map_or(1.0, |used| used[row])
-            })
+            .map(|r| weight(r * per_sigma) * per_square)
             .collect();
+        if let Some(used) = used {
+            weights
+                .iter_mut()
+                .zip(used)
+                .for_each(|(weight, used)| *weight *= used);
+        }
         let (mut matrix, mut right) = normal(&slope.columns, &weights, residual, 0..bench.len());
         slope.penalty(&mut matrix, &mut right);
         let mut gain = 0.0;
@@ -513,7 +628,7 @@ fn descend(
         // A slope that was only carried along may be why the step was small.
         if gain < SLOW {
             if fresh && gain < ENOUGH {
-                return;
+                return (gain == 0.0).then_some(slope);
             }
             slope = self::slope(bench, model, predicted);
             fresh = true;
@@ -521,6 +636,7 @@ fn descend(
             fresh = false;
         }
     }
+    fresh.then_some(slope)
 }
 
 /// Values at which the simulation jumps: tried around where they are, ever closer.
@@ -531,7 +647,8 @@ fn search_steps(
     residual: &mut Vec<f64>,
     sigma: f64,
     used: Option<&[f64]>,
-) {
+    known: Option<Slope>,
+) -> Option<Slope> {
     let mut here = cost(bench, model, residual, sigma, used);
     let mut found = false;
     for m in 0..model.members.len() {
@@ -579,7 +696,9 @@ fn search_steps(
         }
     }
     if found {
-        descend(bench, model, predicted, residual, sigma, used);
+        descend(bench, model, predicted, residual, sigma, used, None)
+    } else {
+        known
     }
 }
 
@@ -587,7 +706,7 @@ fn search_steps(
 #[derive(Debug)]
 pub struct Blocked {
     /// The slope at the fit.
-    pub slope: Slope,
+    pub slope: Arc<Slope>,
     /// Normal matrix of each block.
     pub matrices: Vec<DMatrix<f64>>,
     /// Right side of each block.
@@ -596,7 +715,7 @@ pub struct Blocked {
 
 /// Looks at a fit block by block, with Huber's weights at `sigma`.
 pub fn blocked(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Blocked {
-    let slope = slope(bench, &fit.model, &fit.predicted);
+    let slope = fit.slope(bench);
     let weights: Vec<f64> = fit
         .residual
         .iter()

@@ -7,9 +7,9 @@ use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 use rayon::prelude::*;
 
 use super::fit::{TUNING, dot, normal, solve, spread};
-use super::screen::{held_out_gain, turned};
+use super::screen::{Folds, ITSELF, Turn, turned_products};
 use super::workbench::Workbench;
-use crate::effects::scene::{Cursor, low_pass};
+use crate::effects::scene::{Cursor, Steps};
 
 /// Placebo draws.
 const DRAWS: usize = 60;
@@ -40,7 +40,8 @@ pub struct Features {
     rows: Vec<usize>,
     blocks: Vec<std::ops::Range<usize>>,
     columns: Vec<Vec<f64>>,
-    grams: Vec<DMatrix<f64>>,
+    gram: DMatrix<f64>,
+    folds: Folds,
 }
 
 impl Features {
@@ -66,8 +67,8 @@ impl Features {
         });
         let nothing = vec![0.0; rows.len()];
         let weights = vec![1.0; rows.len()];
-        let grams = blocks
-            .iter()
+        let grams: Vec<DMatrix<f64>> = blocks
+            .par_iter()
             .map(|range| {
                 let (mut gram, _) = normal(&columns, &weights, &nothing, range.clone());
                 for k in 0..gram.nrows() {
@@ -76,11 +77,16 @@ impl Features {
                 gram
             })
             .collect();
+        let mut gram = DMatrix::zeros(columns.len(), columns.len());
+        for part in &grams {
+            gram += part;
+        }
         Self {
             rows,
             blocks,
             columns,
-            grams,
+            gram,
+            folds: Folds::new(grams),
         }
     }
 
@@ -95,45 +101,79 @@ impl Features {
             .iter()
             .map(|&row| residual[row].clamp(-limit, limit))
             .collect();
-        let share = |residual: &[f64]| {
-            let rights: Vec<DVector<f64>> = self
-                .blocks
-                .iter()
-                .map(|rows| {
-                    DVector::from_fn(self.columns.len(), |k, _| {
-                        dot(&self.columns[k][rows.clone()], &residual[rows.clone()])
-                    })
-                })
-                .collect();
-            let all: f64 = self
-                .blocks
-                .iter()
-                .map(|rows| dot(&residual[rows.clone()], &residual[rows.clone()]))
-                .sum();
-            held_out_gain(&self.grams, &rights) / all.max(1e-300)
-        };
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let count = residual.len();
         let least = count / 20;
         let span = (count - 2 * least).max(1) as u32;
-        let draws: Vec<(usize, bool)> = (0..DRAWS)
-            .map(|_| {
+        // The residual as it is comes first.
+        let turns: Vec<Turn> = std::iter::once((0, false))
+            .chain((0..DRAWS).map(|_| {
                 (
                     least + (random.next_u32() % span) as usize,
                     random.next_u32().is_multiple_of(2),
                 )
+            }))
+            .collect();
+        // Where the drive or the residual is like itself when it is moved (a loop that repeats), blocks get random signs instead.
+        let drive = self.columns.get(1).map_or(&residual[..], Vec::as_slice);
+        let repeats: Vec<bool> = turns
+            .iter()
+            .map(|turn| repeats(&residual, *turn) || repeats(drive, *turn))
+            .collect();
+        let signs: Vec<Vec<f64>> = turns
+            .iter()
+            .map(|_| {
+                let sign = |even: bool| if even { 1.0 } else { -1.0 };
+                (0..self.blocks.len())
+                    .map(|_| sign(random.next_u32().is_multiple_of(2)))
+                    .collect()
             })
             .collect();
-        let mut placebos: Vec<f64> = draws
+        let columns: Vec<&[f64]> = self.columns.iter().map(Vec::as_slice).collect();
+        let products = turned_products(&columns, &residual, &turns, &self.blocks);
+        let all = dot(&residual, &residual).max(1e-300);
+        let shares: Vec<f64> = (0..turns.len())
             .into_par_iter()
-            .map(|(by, reversed)| share(&turned(&residual, by, reversed)))
+            .map(|draw| {
+                let flipped = draw > 0 && repeats[draw];
+                let rights: Vec<f64> = products
+                    .iter()
+                    .zip(&signs[draw])
+                    .flat_map(|(products, sign)| {
+                        let (row, sign) = if flipped { (0, *sign) } else { (draw, 1.0) };
+                        products
+                            .row(row)
+                            .iter()
+                            .map(|product| sign * product)
+                            .collect::<Vec<f64>>()
+                    })
+                    .collect();
+                self.folds.gain(&rights) / all
+            })
             .collect();
-        placebos.sort_unstable_by(f64::total_cmp);
         Explainable {
-            share: share(&residual).max(0.0),
-            placebo_p99: placebos.last().copied().unwrap_or_default().max(0.0),
+            share: shares[0].max(0.0),
+            placebo_p99: shares[1..]
+                .iter()
+                .fold(0.0, |most, share| f64::max(most, *share)),
         }
     }
+}
+
+/// Whether a series, less its mean, is like itself when it is turned.
+fn repeats(series: &[f64], (by, reversed): Turn) -> bool {
+    let count = series.len();
+    let mean = series.iter().sum::<f64>() / count.max(1) as f64;
+    let at = |row: usize| {
+        let row = (row + by) % count;
+        series[if reversed { count - 1 - row } else { row }] - mean
+    };
+    let (mut together, mut alone) = (0.0, 0.0);
+    for (row, value) in series.iter().enumerate() {
+        together += (value - mean) * at(row);
+        alone += (value - mean).powi(2);
+    }
+    together.abs() > ITSELF * alone
 }
 
 impl Features {
@@ -145,13 +185,8 @@ impl Features {
             .iter()
             .map(|&row| residual[row].clamp(-limit, limit))
             .collect();
-        let size = self.columns.len();
-        let mut gram = DMatrix::zeros(size, size);
-        for part in &self.grams {
-            gram += part;
-        }
-        let right = DVector::from_fn(size, |k, _| dot(&self.columns[k], &here));
-        let factors = solve(&gram, &right, 1e-9);
+        let right = DVector::from_fn(self.columns.len(), |k, _| dot(&self.columns[k], &here));
+        let factors = solve(&self.gram, &right, 1e-9);
         let mut shape = vec![0.0; self.rows.len()];
         for (column, factor) in self.columns.iter().zip(factors.iter()) {
             shape
@@ -207,13 +242,14 @@ fn columns(bench: &Workbench<'_>, rows: &[usize]) -> Vec<Vec<f64>> {
         push(here.iter().map(|v| (v - knot).max(0.0)).collect());
     }
     // What came before, on two ladders of times.
+    let steps = Steps::new(&drive.t_s, &drive.segments);
     let mut tau = 0.5 * scale.step_s;
     while tau < 0.3 * scale.span_s && tau < 4000.0 * scale.step_s {
-        let slow = low_pass(&drive.t_s, &drive.segments, x, tau, false);
+        let slow = steps.low_pass(&drive.segments, x, tau, false);
         let slow = at_rows(bench, rows, &slow, 0.0);
         push(here.iter().zip(&slow).map(|(v, s)| v - s).collect());
         let squares: Vec<f64> = x.iter().map(|v| v * v / top).collect();
-        let warm = low_pass(&drive.t_s, &drive.segments, &squares, tau, false);
+        let warm = steps.low_pass(&drive.segments, &squares, tau, false);
         let warm = at_rows(bench, rows, &warm, 0.0);
         push(warm.iter().zip(&here).map(|(w, v)| w * v / top).collect());
         push(warm);

@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 
-use super::fit::{Fit, blocked, huber, solve};
+use super::fit::{Fit, blocked, loss, solve};
 use super::workbench::Workbench;
 use crate::effects::Search;
 
@@ -82,7 +82,7 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> Vec<Vec<[f64; 2
 fn profile(bench: &Workbench<'_>, fit: &Fit, member: usize, parameter: usize, sign: f64) -> f64 {
     const RISE: f64 = 0.5 * 3.84;
     let value = fit.model.members[member].values[parameter];
-    let loss = |residual: &[f64]| residual.iter().map(|r| huber(r / fit.sigma)).sum::<f64>();
+    let loss = |residual: &[f64]| loss(residual, fit.sigma);
     let here = loss(&fit.residual);
     let mut share = 1e-6;
     let mut last = value;

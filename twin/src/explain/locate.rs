@@ -188,14 +188,37 @@ fn region(
         })
         .collect();
     cuts.dedup();
+    // Rows of one range mostly follow each other: runs of them, and what the energy adds up to until each row.
+    let mut range_of = vec![usize::MAX; energy.len()];
+    for (k, pair) in cuts.windows(2).enumerate() {
+        for &row in &order[pair[0]..pair[1]] {
+            range_of[row] = k;
+        }
+    }
+    let mut runs: Vec<Vec<(usize, usize)>> = vec![Vec::new(); cuts.len()];
+    let mut from = 0;
+    for run in range_of.chunk_by(|a, b| a == b) {
+        if let Some(runs) = runs.get_mut(run[0]) {
+            runs.push((from, from + run.len()));
+        }
+        from += run.len();
+    }
+    let mut until = Vec::with_capacity(2 * energy.len() + 1);
+    let mut sum = 0.0;
+    until.push(sum);
+    for value in energy.iter().chain(energy) {
+        sum += value;
+        until.push(sum);
+    }
     let sums = |shift: usize| -> Vec<f64> {
+        let shift = shift % energy.len();
         let mut sums = vec![0.0; cuts.len()];
-        for (k, pair) in cuts.windows(2).enumerate() {
-            let part: f64 = order[pair[0]..pair[1]]
+        for k in 1..cuts.len() {
+            let part: f64 = runs[k - 1]
                 .iter()
-                .map(|&row| energy[(row + shift) % energy.len()])
+                .map(|(from, to)| until[to + shift] - until[from + shift])
                 .sum();
-            sums[k + 1] = sums[k] + part;
+            sums[k] = sums[k - 1] + part;
         }
         sums
     };

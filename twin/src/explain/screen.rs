@@ -6,12 +6,13 @@
 //! same signature against the residual moved in time (and half of them reversed): whatever it gains is chance and colour of the
 //! noise. Each draw keeps the best of all candidates, so that trying many effects is paid for.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DMatrixView, DVector, Dyn};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 use rayon::prelude::*;
+use rustfft::{Fft, FftPlanner, num_complex::Complex};
 
-use super::fit::{Fit, TUNING, dot, normal, slope, solve, spread};
+use super::fit::{Fit, Solver, TUNING, dot, normal, spread};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search};
 
@@ -20,7 +21,7 @@ pub const DRAWS: usize = 200;
 /// Rows that signatures are compared over; longer recordings are thinned out.
 const MOST_ROWS: usize = 30_000;
 /// A residual moved to where a candidate looks like itself again is no placebo for it: signs are drawn then.
-const ITSELF: f64 = 0.6;
+pub const ITSELF: f64 = 0.6;
 
 /// A candidate with the values from which its signature was taken.
 #[derive(Clone, Debug)]
@@ -30,7 +31,9 @@ pub struct Entry {
     /// Squared error that it removes from held-out blocks, as a share of all of it.
     pub gain: f64,
     columns: Vec<Vec<f64>>,
-    grams: Vec<DMatrix<f64>>,
+    folds: Folds,
+    /// Products of the columns with the residual, block by block.
+    rights: Vec<f64>,
 }
 
 /// What screening a residual gives.
@@ -75,17 +78,20 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
         .into_iter()
         .map(|r| r.clamp(-limit, limit))
         .collect();
-    let own: Vec<Vec<f64>> = slope(bench, &fit.model, &fit.predicted)
+    let own: Vec<Vec<f64>> = fit
+        .slope(bench)
         .columns
         .iter()
         .map(|column| take(column))
         .collect();
     let weights = vec![1.0; residual.len()];
     let (own_normal, _) = normal(&own, &weights, &residual, 0..residual.len());
+    let own_solver = Solver::new(&own_normal, 1e-9);
+    let all = dot(&residual, &residual).max(1e-300);
     let clean = |mut column: Vec<f64>| -> Vec<f64> {
         if !own.is_empty() {
-            let along = DVector::from_fn(own.len(), |k, _| dot(&own[k], &column));
-            let factors = solve(&own_normal, &along, 1e-9);
+            let mut factors = DVector::from_fn(own.len(), |k, _| dot(&own[k], &column));
+            own_solver.solve(&mut factors);
             for (own, factor) in own.iter().zip(factors.iter()) {
                 column
                     .iter_mut()
@@ -136,18 +142,29 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
             if columns.is_empty() {
                 return None;
             }
-            let grams = thin
+            let folds = Folds::new(
+                thin.blocks
+                    .iter()
+                    .map(|rows| normal(&columns, &weights, &residual, rows.clone()).0)
+                    .collect(),
+            );
+            let rights: Vec<f64> = thin
                 .blocks
                 .iter()
-                .map(|rows| normal(&columns, &weights, &residual, rows.clone()).0)
+                .flat_map(|rows| {
+                    let residual = &residual[rows.clone()];
+                    columns
+                        .iter()
+                        .map(|column| dot(&column[rows.clone()], residual))
+                })
                 .collect();
-            let mut entry = Entry {
+            let entry = Entry {
                 member: Member { effect, values },
-                gain: 0.0,
+                gain: folds.gain(&rights) / all,
                 columns,
-                grams,
+                folds,
+                rights,
             };
-            entry.gain = gain(&entry, &residual, &thin.blocks);
             Some(entry)
         })
         .collect();
@@ -215,41 +232,156 @@ fn probes(effect: &'static dyn Effect, values: &[f64]) -> Vec<Vec<f64>> {
         .collect()
 }
 
-/// Share of the squared error that the columns remove from blocks with factors from the other blocks.
-fn gain(entry: &Entry, residual: &[f64], blocks: &[std::ops::Range<usize>]) -> f64 {
-    let size = entry.columns.len();
-    let rights: Vec<DVector<f64>> = blocks
-        .iter()
-        .map(|rows| {
-            DVector::from_fn(size, |k, _| {
-                dot(&entry.columns[k][rows.clone()], &residual[rows.clone()])
-            })
-        })
-        .collect();
-    let all: f64 = blocks
-        .iter()
-        .map(|rows| dot(&residual[rows.clone()], &residual[rows.clone()]))
-        .sum();
-    held_out_gain(&entry.grams, &rights) / all.max(1e-300)
+/// What is needed again and again to score columns on blocks with factors from the other blocks.
+#[derive(Clone, Debug)]
+pub struct Folds {
+    grams: Vec<DMatrix<f64>>,
+    /// For each block, the others made ready.
+    others: Vec<Solver>,
 }
 
-/// Σ over blocks of 2·βᵀs − βᵀGβ with β from the other blocks.
-pub fn held_out_gain(grams: &[DMatrix<f64>], rights: &[DVector<f64>]) -> f64 {
-    let size = rights.first().map_or(0, DVector::len);
-    let mut gram = DMatrix::zeros(size, size);
-    let mut right = DVector::zeros(size);
-    for (g, r) in grams.iter().zip(rights) {
-        gram += g;
-        right += r;
+impl Folds {
+    /// Of the columns' normal matrix in each block.
+    pub fn new(grams: Vec<DMatrix<f64>>) -> Self {
+        let size = grams.first().map_or(0, DMatrix::nrows);
+        let mut all = DMatrix::zeros(size, size);
+        for gram in &grams {
+            all += gram;
+        }
+        let others = grams
+            .iter()
+            .map(|gram| Solver::new(&(&all - gram), 1e-9))
+            .collect();
+        Self { grams, others }
     }
-    grams
-        .iter()
-        .zip(rights)
-        .map(|(g, r)| {
-            let beta = solve(&(&gram - g), &(&right - r), 1e-9);
-            2.0 * beta.dot(r) - beta.dot(&(g * &beta))
+
+    /// Σ over blocks of 2·βᵀs − βᵀGβ with β from the other blocks; `rights` are the products s, block by block.
+    pub fn gain(&self, rights: &[f64]) -> f64 {
+        let size = self.grams.first().map_or(0, DMatrix::nrows);
+        let mut all = DVector::<f64>::zeros(size);
+        for right in rights.chunks_exact(size.max(1)) {
+            for (all, right) in all.iter_mut().zip(right) {
+                *all += right;
+            }
+        }
+        let mut beta = DVector::<f64>::zeros(size);
+        let mut gain = 0.0;
+        for ((gram, others), right) in self
+            .grams
+            .iter()
+            .zip(&self.others)
+            .zip(rights.chunks_exact(size.max(1)))
+        {
+            for ((beta, all), right) in beta.iter_mut().zip(&all).zip(right) {
+                *beta = all - right;
+            }
+            others.solve(&mut beta);
+            for (a, right) in right.iter().enumerate() {
+                let taken: f64 = (0..size).map(|b| gram[(b, a)] * beta[b]).sum();
+                gain += beta[a] * (2.0 * right - taken);
+            }
+        }
+        gain
+    }
+}
+
+/// How a placebo moves a residual: around by some rows, reversed first or not.
+pub type Turn = (usize, bool);
+
+/// Products of columns with a residual moved in many ways: for each block, a row for each way and a column for each column.
+pub fn turned_products(
+    columns: &[&[f64]],
+    residual: &[f64],
+    turns: &[Turn],
+    blocks: &[std::ops::Range<usize>],
+) -> Vec<DMatrix<f64>> {
+    let count = residual.len();
+    let forward = [residual, residual].concat();
+    let backward: Vec<f64> = forward.iter().rev().copied().collect();
+    blocks
+        .into_par_iter()
+        .map(|rows| {
+            let length = rows.len();
+            let mut moved = Vec::with_capacity(length * turns.len());
+            for (by, reversed) in turns {
+                let from = by % count.max(1) + rows.start;
+                let whole = if *reversed { &backward } else { &forward };
+                moved.extend_from_slice(&whole[from..from + length]);
+            }
+            let here: Vec<f64> = columns
+                .iter()
+                .flat_map(|column| &column[rows.clone()])
+                .copied()
+                .collect();
+            // One way after the other, each a row of the left matrix.
+            let moved = DMatrixView::from_slice_with_strides_generic(
+                &moved,
+                Dyn(turns.len()),
+                Dyn(length),
+                Dyn(length),
+                nalgebra::U1,
+            );
+            let here = DMatrixView::from_slice(&here, length, columns.len());
+            let mut products = DMatrix::zeros(turns.len(), columns.len());
+            products.gemm(1.0, &moved, &here, 0.0);
+            products
         })
-        .sum()
+        .collect()
+}
+
+/// How much a series is like itself when it is moved: its correlation with itself at every way.
+struct Likeness {
+    forward: std::sync::Arc<dyn Fft<f64>>,
+    inverse: std::sync::Arc<dyn Fft<f64>>,
+    length: usize,
+}
+
+impl Likeness {
+    /// For series of some rows.
+    fn new(count: usize) -> Self {
+        let least = (2 * count).max(2);
+        // Lengths of small factors are fast.
+        let length = [1, 3, 5]
+            .iter()
+            .map(|factor| factor * least.div_ceil(*factor).next_power_of_two())
+            .fold(usize::MAX, usize::min);
+        let mut planner = FftPlanner::new();
+        Self {
+            forward: planner.plan_fft_forward(length),
+            inverse: planner.plan_fft_inverse(length),
+            length,
+        }
+    }
+
+    /// Correlations of a series with itself moved.
+    fn of(&self, series: &[f64], turns: &[Turn]) -> Vec<f64> {
+        let count = series.len();
+        let mut cells = vec![Complex::new(0.0, 0.0); self.length];
+        for (cell, value) in cells.iter_mut().zip(series) {
+            cell.re = *value;
+        }
+        self.forward.process(&mut cells);
+        // Both at once: with itself in the real part, with itself reversed in the imaginary one.
+        for cell in &mut cells {
+            let square = *cell * *cell;
+            *cell = Complex::new(cell.norm_sqr() - square.im, square.re);
+        }
+        self.inverse.process(&mut cells);
+        let size = dot(series, series) * self.length as f64;
+        turns
+            .iter()
+            .map(|(by, reversed)| {
+                let by = by % count.max(1);
+                let product = match (reversed, by) {
+                    (false, 0) => cells[0].re,
+                    (false, _) => cells[by].re + cells[count - by].re,
+                    (true, 0) => cells[count - 1].im,
+                    (true, _) => cells[count - 1 - by].im + cells[2 * count - 1 - by].im,
+                };
+                product / size
+            })
+            .collect()
+    }
 }
 
 fn placebos(
@@ -266,88 +398,86 @@ fn placebos(
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let least = count / 20;
     let span = (count - 2 * least).max(1) as u32;
-    let tries: Vec<Try> = (0..draws)
-        .map(|_| Try {
-            by: least + (random.next_u32() % span) as usize,
-            reversed: random.next_u32().is_multiple_of(2),
-            signs: blocks
-                .iter()
-                .map(|_| {
-                    if random.next_u32().is_multiple_of(2) {
-                        1.0
-                    } else {
-                        -1.0
-                    }
-                })
-                .collect(),
+    let mut turns: Vec<Turn> = Vec::with_capacity(draws);
+    let mut signs: Vec<Vec<f64>> = Vec::with_capacity(draws);
+    for _ in 0..draws {
+        turns.push((
+            least + (random.next_u32() % span) as usize,
+            random.next_u32().is_multiple_of(2),
+        ));
+        let sign = |_| {
+            if random.next_u32().is_multiple_of(2) {
+                1.0
+            } else {
+                -1.0
+            }
+        };
+        signs.push(blocks.iter().map(sign).collect());
+    }
+    let all = dot(residual, residual).max(1e-300);
+    let likeness = Likeness::new(count);
+    // A residual that is much the same when it is moved (one pulse, a constant) is a placebo for nothing.
+    let same: Vec<bool> = likeness
+        .of(residual, &turns)
+        .into_iter()
+        .map(|alike| alike.abs() > ITSELF)
+        .collect();
+    let columns: Vec<&[f64]> = entries
+        .iter()
+        .flat_map(|entry| entry.columns.iter().map(Vec::as_slice))
+        .collect();
+    let products = turned_products(&columns, residual, &turns, blocks);
+    let firsts: Vec<usize> = entries
+        .iter()
+        .scan(0, |next, entry| {
+            let first = *next;
+            *next += entry.columns.len();
+            Some(first)
         })
         .collect();
-    let mut best: Vec<f64> = tries
-        .into_par_iter()
-        .map(|this| {
-            let moved = turned(residual, this.by, this.reversed);
-            // A residual that is much the same when it is moved (one pulse, a constant) is a placebo for nothing.
-            let same = dot(residual, &moved).abs() > ITSELF * dot(residual, residual);
-            entries
-                .iter()
-                .map(|entry| {
-                    let itself = same
-                        || entry.columns.iter().any(|column| {
-                            let size = dot(column, column);
-                            (dot(column, &turned(column, this.by, this.reversed)) / size).abs()
-                                > ITSELF
-                        });
-                    if itself {
-                        flipped(entry, residual, blocks, &this.signs)
+    // Gains of each entry, draw by draw.
+    let gains: Vec<Vec<f64>> = entries
+        .par_iter()
+        .zip(firsts)
+        .map(|(entry, first)| {
+            let mut itself = same.clone();
+            for column in &entry.columns {
+                for (itself, alike) in itself.iter_mut().zip(likeness.of(column, &turns)) {
+                    *itself |= alike.abs() > ITSELF;
+                }
+            }
+            let size = entry.columns.len();
+            (0..turns.len())
+                .map(|draw| {
+                    let rights: Vec<f64> = if itself[draw] {
+                        // Signatures that stay like themselves when they are moved (a constant, a slow drift, a periodic load)
+                        // differ from chance only by being the same in every block.
+                        entry
+                            .rights
+                            .chunks_exact(size)
+                            .zip(&signs[draw])
+                            .flat_map(|(right, sign)| right.iter().map(move |r| sign * r))
+                            .collect()
                     } else {
-                        gain(entry, &moved, blocks)
-                    }
+                        products
+                            .iter()
+                            .flat_map(|products| {
+                                (0..size).map(move |k| products[(draw, first + k)])
+                            })
+                            .collect()
+                    };
+                    entry.folds.gain(&rights) / all
                 })
-                .fold(0.0, f64::max)
+                .collect()
+        })
+        .collect();
+    let mut best: Vec<f64> = (0..turns.len())
+        .map(|draw| {
+            gains
+                .iter()
+                .fold(0.0, |most, gains| f64::max(most, gains[draw]))
         })
         .collect();
     best.sort_unstable_by(f64::total_cmp);
     best[(best.len() * 99).div_ceil(100).min(best.len()) - 1]
-}
-
-/// The gain of an entry when each block has a sign of its own: for signatures that stay like themselves when they are moved
-/// (a constant, a slow drift, a periodic load), where only being the same in every block tells them from chance.
-fn flipped(
-    entry: &Entry,
-    residual: &[f64],
-    blocks: &[std::ops::Range<usize>],
-    signs: &[f64],
-) -> f64 {
-    let size = entry.columns.len();
-    let rights: Vec<DVector<f64>> = blocks
-        .iter()
-        .zip(signs)
-        .map(|(rows, sign)| {
-            DVector::from_fn(size, |k, _| {
-                sign * dot(&entry.columns[k][rows.clone()], &residual[rows.clone()])
-            })
-        })
-        .collect();
-    let all: f64 = blocks
-        .iter()
-        .map(|rows| dot(&residual[rows.clone()], &residual[rows.clone()]))
-        .sum();
-    held_out_gain(&entry.grams, &rights) / all.max(1e-300)
-}
-
-/// One placebo draw.
-struct Try {
-    by: usize,
-    reversed: bool,
-    signs: Vec<f64>,
-}
-
-/// Moved around by some rows, reversed first if asked for.
-pub fn turned(series: &[f64], by: usize, reversed: bool) -> Vec<f64> {
-    let mut turned = series.to_vec();
-    if reversed {
-        turned.reverse();
-    }
-    turned.rotate_left(by % series.len().max(1));
-    turned
 }

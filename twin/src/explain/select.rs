@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::fit::{Fit, fit, held_out, huber, polish, spread};
+use super::fit::{Fit, fit, held_out, huber, polish};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search, Stage, find};
@@ -22,6 +22,9 @@ const STARTS: usize = 2;
 const FLOOR: f64 = 0.04;
 /// A smaller one takes away at least this share where it acts.
 const PLACE: f64 = 0.12;
+/// Standard deviations of the stated noise that an effect has to be away from nothing: one in a thousand recordings has an effect
+/// of some thirty by chance that is 4.2 away.
+const CERTAIN: f64 = 4.2;
 /// Rows where an effect changes the reading by at least this share of its largest change are where it acts.
 const ACTS: f64 = 0.2;
 /// Share of the held-out error from which on a single effect is clear by itself.
@@ -160,7 +163,13 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
             Some(better) if rounds < 3 => now = better,
             _ => {
                 progress(0.92, "asking which other effects would do as well");
-                let now = polish(bench, &now);
+                let mut now = polish(bench, &now);
+                let mut others = others;
+                // The last exchange may have made another one needless.
+                if let Some(leaner) = backward(bench, &now, &step_p99, &mut decisions) {
+                    now = polish(bench, &leaner);
+                    others = swapped(bench, &now);
+                }
                 let named = name(bench, &now, &others, &step_p99);
                 // Small, and as well explained by many others: that is structure, and no name.
                 let Some(vague) = named
@@ -220,7 +229,7 @@ fn marked(
             card.id,
             percent(gain)
         ));
-        let smooth = fit(bench, &base, None);
+        let smooth = missed(bench, fit(bench, &base, None));
         let model = smooth.model.with(Member {
             effect,
             values: mark.values,
@@ -244,17 +253,24 @@ fn marked(
             equivalent: Vec::new(),
         });
         // The other values are those of the smooth simulation: steps have no slope to fit by.
-        let predicted = bench.run(&model);
-        let residual = bench.residual(&predicted);
-        now = Fit {
-            sigma: spread(&residual),
-            model,
-            predicted,
-            residual,
-            cost: smooth.cost,
-        };
+        now = Fit::of(bench, model, smooth.cost);
     }
     (now, named)
+}
+
+/// Leaves out what is too small beside the others: steps make single readings jump by what hardly moves them.
+fn missed(bench: &Workbench<'_>, mut now: Fit) -> Fit {
+    let mut index = 0;
+    while index < now.model.members.len() {
+        let without = fit(bench, &now.model.without(index), None);
+        let gain = share(bench, &without, &now);
+        if obstacle(bench, &without, &now, index, gain).is_some() {
+            now = without;
+        } else {
+            index += 1;
+        }
+    }
+    now
 }
 
 /// Fits the most promising entries in place of nothing.
@@ -401,6 +417,21 @@ fn obstacle(
             percent(FLOOR)
         ));
     }
+    let beside = beside(bench, after, index);
+    let all: f64 = change.iter().map(|c| c * c).sum();
+    if all < beside {
+        return Some(format!(
+            "{:.2} rms, which the equations of the others may be off by ({:.2})",
+            (all / bench.len() as f64).sqrt(),
+            (beside / bench.len() as f64).sqrt()
+        ));
+    }
+    let deviations = bench.deviations(&change);
+    if deviations < CERTAIN {
+        return Some(format!(
+            "{deviations:.1} standard deviations of what the stated coloured noise does by itself"
+        ));
+    }
     let noise = to / rows;
     if card.stage == Stage::Output
         && card
@@ -450,6 +481,29 @@ fn obstacle(
     None
 }
 
+/// Energy by which the other effects' equations may be off.
+fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
+    let members = &fit.model.members;
+    (0..members.len())
+        .filter(|other| *other != index)
+        .map(|other| {
+            let share = members[other].effect.idealised();
+            if share == 0.0 {
+                return 0.0;
+            }
+            let without = bench.run(&fit.model.without(other));
+            let energy: f64 = fit
+                .predicted
+                .iter()
+                .zip(&without)
+                .map(|(with, without)| (with - without).powi(2))
+                .filter(|change| change.is_finite())
+                .sum();
+            share * share * energy
+        })
+        .sum()
+}
+
 /// Two effects that hide each other: neither passes alone, both together do.
 fn pair(
     bench: &Workbench<'_>,
@@ -475,6 +529,8 @@ fn pair(
             fits(bench, first, &next.entries, FIRSTS, 1)
         })
         .map(|(fit, _)| fit)
+        // One more branch of the first is no second effect.
+        .filter(|fit| fit.model.members.len() == now.model.members.len() + 2)
         .collect();
     let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
     let mut ranked: Vec<(Fit, f64)> = fits
@@ -642,9 +698,22 @@ fn swapped(bench: &Workbench<'_>, now: &Fit) -> Vec<(usize, Fit)> {
             let id = now.model.members[index].id();
             let without = fit(bench, &now.model.without(index), None);
             let rivals = rivals(bench, &without, &now.model, id);
-            rivals
+            // An alignment that is free can take over what a rival explains, and leave it nothing to be named for.
+            let models: Vec<Model> = rivals
+                .into_iter()
+                .map(|rival| without.model.with(rival))
+                .flat_map(|model| {
+                    let unaligned = bench.aligns(&model).then(|| Model {
+                        unaligned: true,
+                        ..model.clone()
+                    });
+                    [Some(model), unaligned]
+                })
+                .flatten()
+                .collect();
+            models
                 .into_par_iter()
-                .map(|rival| (index, fit(bench, &without.model.with(rival), None)))
+                .map(|model| (index, fit(bench, &model, None)))
                 .collect::<Vec<_>>()
         })
         .collect()

@@ -1,8 +1,14 @@
 //! One problem, ready to be fitted: the rows that count, blocks of them, and what sizes are natural.
 
+use std::collections::HashMap;
 use std::ops::Range;
+use std::sync::Mutex;
 
-use crate::effects::chain::{Chain, Nuisance};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng as _;
+use rand_distr::{Distribution as _, StandardNormal};
+
+use crate::effects::chain::{Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
 use crate::effects::{Clues, Effect, LIBRARY, Stage};
 use crate::problem::{Base, Problem};
@@ -45,6 +51,8 @@ pub struct Model {
     pub members: Vec<Member>,
     /// The base.
     pub nuisance: Nuisance,
+    /// Samples stand at their rows, though an effect works between them.
+    pub unaligned: bool,
 }
 
 impl Model {
@@ -95,6 +103,30 @@ pub struct Workbench<'a> {
     pub blocks: Vec<Range<usize>>,
     /// Effects that may be named.
     pub library: Vec<&'static dyn Effect>,
+    /// Fits that were made: from which model to which, with spread and loss.
+    known: Mutex<HashMap<Key, (Model, f64, f64)>>,
+}
+
+/// A model to the last digit.
+type Key = (Vec<(&'static str, Vec<u64>)>, [u64; 3], bool);
+
+fn key(model: &Model) -> Key {
+    let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect();
+    let nuisance = &model.nuisance;
+    (
+        model
+            .members
+            .iter()
+            .map(|member| (member.id(), bits(&member.values)))
+            .collect(),
+        [
+            nuisance.soc_shift,
+            nuisance.resistance,
+            nuisance.alignment_s,
+        ]
+        .map(f64::to_bits),
+        model.unaligned,
+    )
 }
 
 impl<'a> Workbench<'a> {
@@ -140,6 +172,19 @@ impl<'a> Workbench<'a> {
             reference,
             blocks,
             library,
+            known: Mutex::default(),
+        }
+    }
+
+    /// The model that a fit from this one ended at, with spread and loss, if it was made before.
+    pub fn known(&self, from: &Model) -> Option<(Model, f64, f64)> {
+        self.known.lock().ok()?.get(&key(from)).cloned()
+    }
+
+    /// Remembers where a fit ended.
+    pub fn remember(&self, from: &Model, to: &Model, sigma: f64, cost: f64) {
+        if let Ok(mut known) = self.known.lock() {
+            known.insert(key(from), (to.clone(), sigma, cost));
         }
     }
 
@@ -155,17 +200,71 @@ impl<'a> Workbench<'a> {
 
     /// The simulation at every observed row.
     pub fn everywhere(&self, model: &Model) -> Vec<f64> {
-        let members: Vec<(&'static dyn Effect, &[f64])> = model
-            .members
-            .iter()
-            .map(|member| (member.effect, member.values.as_slice()))
+        self.chain.run(&members(model), model.nuisance)
+    }
+
+    /// Squared change, summed over the rows that count, that noise of a standard deviation ahead of the end of the chain makes to
+    /// the simulation: a reading near a threshold jumps by noise, and a stepped one has the steps twice.
+    pub fn noise_energy(&self, model: &Model, predicted: &[f64], deviation: f64, seed: u64) -> f64 {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let noise: Vec<f64> = StandardNormal
+            .sample_iter(&mut random)
+            .take(self.problem.observed.t_s.len())
+            .map(|value: f64| deviation * value)
             .collect();
-        self.chain.run(&members, model.nuisance)
+        let noisy = self
+            .chain
+            .run_with_noise(&members(model), model.nuisance, &noise);
+        self.rows
+            .iter()
+            .zip(predicted)
+            .map(|(&row, predicted)| (noisy[row] - predicted).powi(2))
+            .filter(|change| change.is_finite())
+            .sum()
+    }
+
+    /// How many standard deviations a fitted change is away from what the stated coloured noise does by itself: its projection
+    /// on the change has the variance `cᵀΣc`, with Σ of an exponential memory and white noise. Infinite if none is stated.
+    pub fn deviations(&self, change: &[f64]) -> f64 {
+        let coloured = self.problem.coloured;
+        if !(coloured.rms > 0.0 && coloured.tau_s > 0.0) {
+            return f64::INFINITY;
+        }
+        let (mut energy, mut together, mut memory) = (0.0, 0.0, 0.0);
+        let mut last: Option<(f64, f64)> = None;
+        for (t, c) in self.t_s.iter().zip(change) {
+            if let Some((before, previous)) = last {
+                memory = (memory + previous) * (-(t - before).max(0.0) / coloured.tau_s).exp();
+            }
+            energy += c * c;
+            together += c * memory;
+            last = Some((*t, *c));
+        }
+        let variance = self.problem.noise.powi(2) * energy + 2.0 * coloured.rms.powi(2) * together;
+        energy / variance.max(1e-300).sqrt()
     }
 
     /// The simulation at the rows that count.
     pub fn run(&self, model: &Model) -> Vec<f64> {
-        let all = self.everywhere(model);
+        self.thinned(self.everywhere(model))
+    }
+
+    /// The simulation of models that each differ from one in a single respect, at the rows that count.
+    pub fn vary(&self, model: &Model, others: &[(Change, Model)]) -> Vec<Vec<f64>> {
+        let variations: Vec<Variation<'_>> = others
+            .iter()
+            .map(|(change, other)| (*change, members(other), other.nuisance))
+            .collect();
+        self.chain
+            .vary(&members(model), model.nuisance, &variations, |all| {
+                self.thinned(all)
+            })
+    }
+
+    fn thinned(&self, all: Vec<f64>) -> Vec<f64> {
+        if self.rows.len() == all.len() {
+            return all;
+        }
         self.rows.iter().map(|&row| all[row]).collect()
     }
 
@@ -191,11 +290,20 @@ impl<'a> Workbench<'a> {
     /// Whether the sub-step alignment is free in a model: an effect works on what is between the samples.
     pub fn aligns(&self, model: &Model) -> bool {
         matches!(self.problem.base, Base::Sensor(_))
+            && !model.unaligned
             && !model.has("delay")
             && model.members.iter().any(|member| {
                 matches!(member.effect.card().stage, Stage::Filter | Stage::Converter)
             })
     }
+}
+
+fn members(model: &Model) -> Vec<(&'static dyn Effect, &[f64])> {
+    model
+        .members
+        .iter()
+        .map(|member| (member.effect, member.values.as_slice()))
+        .collect()
 }
 
 fn nearest(problem: &Problem, rows: &[usize]) -> Vec<f64> {

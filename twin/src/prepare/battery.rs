@@ -4,7 +4,7 @@ use super::{Item, Purpose, Work, checks, held::Freshness, series};
 use crate::{
     failure::Failure,
     model::Battery,
-    problem::{Accuracy, Base, BatteryBase, Drive, Observed, Problem, View},
+    problem::{Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, View},
     simulate::board::Pace,
 };
 
@@ -119,6 +119,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
                 base: Base::Battery(base),
                 modelled: Vec::new(),
                 noise,
+                coloured: Coloured::default(),
                 accuracy: Accuracy {
                     zero: accuracy.zero,
                     gain: accuracy.gain,

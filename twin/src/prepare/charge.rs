@@ -6,7 +6,7 @@ use super::{FEWEST_ROWS, Item, Purpose, Work, checks, phase, series};
 use crate::{
     failure::Failure,
     model::Sensor,
-    problem::{Accuracy, Base, Drive, Observed, Problem, SensorBase, View},
+    problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View},
     simulate::board::{Board, Pace},
 };
 
@@ -63,7 +63,12 @@ pub(super) fn item(
         ));
     }
     let spacing_s = series::spacing_s(&observed).max(f64::MIN_POSITIVE);
-    let noise_c = (spec.noise_c.powi(2) + step_c * step_c / 12.0).sqrt();
+    let squares: f64 = drive.reference.iter().map(|i| i * i).sum();
+    let typical_a = (squares / drive.len().max(1) as f64).sqrt();
+    // Steps and uncertain moments are spread evenly: the variance of a width is its square by twelve.
+    let noise_c = (spec.noise_c.powi(2)
+        + (step_c.powi(2) + (typical_a * spec.jitter_s).powi(2)) / 12.0)
+        .sqrt();
     let mut base = SensorBase {
         // A counter has no window of its own.
         step: step_c / spacing_s,
@@ -105,9 +110,11 @@ pub(super) fn item(
         modelled: Vec::new(),
         // A difference has the noise of both of its readings.
         noise: std::f64::consts::SQRT_2 * noise_c / spacing_s,
+        coloured: Coloured::default(),
         accuracy: Accuracy {
             zero: sensor.accuracy.zero,
-            gain: sensor.accuracy.gain,
+            // What an uncertain moment moves a difference by is no physics either.
+            gain: sensor.accuracy.gain + spec.jitter_s / 6f64.sqrt() / spacing_s,
         },
     };
     Ok(Some(Item {

@@ -11,7 +11,7 @@ use crate::{
     failure::Failure,
     model::Model,
     prepare::{Inputs, Item, Prepared, Purpose, prepare},
-    problem::{Base, View},
+    problem::{Base, Problem, View},
     progress::Progress,
 };
 
@@ -137,25 +137,23 @@ fn counter(model: &Model, prepared: &Prepared) -> Option<Vec<f64>> {
     }
     if let Some(board) = Board::new(sensor.front_end, sensor.average.unwrap_or(1)) {
         let held = matches!(&problem.base, Base::Sensor(base) if base.held_reference);
-        return Some(
-            board
-                .run(&problem.drive, held, &problem.observed, item.pace, true)
-                .charge_c,
-        );
+        let mut charge_c = board
+            .run(&problem.drive, held, &problem.observed, item.pace, true)
+            .charge_c;
+        if !problem.modelled.is_empty() {
+            // What the effects add to the current, the meter counts too.
+            let (designed, extended) = (super::designed(problem), predicted(item));
+            let added: Vec<f64> = extended.iter().zip(designed).map(|(e, d)| e - d).collect();
+            charge_c
+                .iter_mut()
+                .zip(integral_c(problem, &added))
+                .for_each(|(charge, more)| *charge += more);
+        }
+        return Some(charge_c);
     }
     let charge = model.charge.as_ref()?;
-    let current = predicted(item);
-    let mut sum = 0.0;
     let step = charge.step_c;
-    let counted = (0..current.len()).map(|row| {
-        let observed = &problem.observed;
-        if row > 0 && observed.segment[row] == observed.segment[row - 1] {
-            let h = observed.t_s[row] - observed.t_s[row - 1];
-            let mean = 0.5 * (current[row] + current[row - 1]);
-            if mean.is_finite() {
-                sum += mean * h;
-            }
-        }
+    let counted = integral_c(problem, &predicted(item)).into_iter().map(|sum| {
         if step > 0.0 {
             (sum / step).floor() * step
         } else {
@@ -163,4 +161,22 @@ fn counter(model: &Model, prepared: &Prepared) -> Option<Vec<f64>> {
         }
     });
     Some(counted.collect())
+}
+
+/// Charge of a current, in A, at the observed rows: straight lines between them, nothing over gaps.
+fn integral_c(problem: &Problem, current_a: &[f64]) -> Vec<f64> {
+    let observed = &problem.observed;
+    let mut sum = 0.0;
+    (0..current_a.len())
+        .map(|row| {
+            if row > 0 && observed.segment[row] == observed.segment[row - 1] {
+                let h = observed.t_s[row] - observed.t_s[row - 1];
+                let mean = 0.5 * (current_a[row] + current_a[row - 1]);
+                if mean.is_finite() {
+                    sum += mean * h;
+                }
+            }
+            sum
+        })
+        .collect()
 }

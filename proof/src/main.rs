@@ -1,0 +1,232 @@
+//! `prove`: the campaign that shows where `twin explain` is right, wrong or silent, and on whose data.
+
+mod board;
+mod bounds;
+mod case;
+mod make;
+mod methods;
+mod pages;
+mod plan;
+mod program;
+mod real;
+mod results;
+mod run;
+mod score;
+mod seal;
+mod stats;
+mod summary;
+mod table;
+mod tool;
+
+use std::{fs, path::PathBuf, process, process::ExitCode, thread, time::Duration};
+
+use anyhow::{Context, Result};
+use clap::{Args, Parser, Subcommand};
+
+use crate::{
+    board::Board, make::Makers, methods::Methods, plan::Extent, run::Campaign, tool::Tool,
+};
+
+/// A bound of the quick campaign does not hold.
+const FAILED: u8 = 1;
+/// Something could not be done at all.
+const MISSING: u8 = 2;
+
+#[derive(Parser)]
+#[command(
+    name = "prove",
+    version,
+    about = "Shows where `twin explain` is right, wrong or silent, and on whose data"
+)]
+struct CommandLine {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Run what is not there yet, and write tables and pages
+    #[command(
+        after_help = "Example:\n  cargo xtask prove --quick     builds what is needed and calls this"
+    )]
+    Run(Box<Run>),
+    /// List the cases
+    List {
+        /// How much of the campaign
+        #[arg(long, value_enum, default_value = "full")]
+        plan: Extent,
+        /// The checkout's top folder
+        #[arg(long, default_value = ".")]
+        root: PathBuf,
+    },
+}
+
+#[derive(Args)]
+struct Run {
+    /// How much of the campaign
+    #[arg(long, value_enum, default_value = "full")]
+    plan: Extent,
+    /// The checkout's top folder
+    #[arg(long, default_value = ".")]
+    root: PathBuf,
+    /// Where data, results and tables go; a broken run goes on from there
+    #[arg(long)]
+    out: PathBuf,
+    /// Where the pages go; without it beside the tables
+    #[arg(long)]
+    docs: Option<PathBuf>,
+    /// The program under test
+    #[arg(long)]
+    twin: PathBuf,
+    /// The emulator; without it the emulated board is left out
+    #[arg(long, requires = "image")]
+    emulate: Option<PathBuf>,
+    /// The firmware image
+    #[arg(long, requires = "emulate")]
+    image: Option<PathBuf>,
+    /// The interpreter with the packages of proof/requirements.txt
+    #[arg(long, default_value = "python3")]
+    python: PathBuf,
+    /// The makers, if not those of the checkout
+    #[arg(long)]
+    makers: Option<PathBuf>,
+    /// Today's methods, if not those of the checkout
+    #[arg(long)]
+    methods: Option<PathBuf>,
+    /// Cases that run at once; without it one for each processor
+    #[arg(long)]
+    workers: Option<usize>,
+    /// Only cases whose id has this in it
+    #[arg(long)]
+    only: Option<String>,
+    /// Keep the data of every case, not only of those that went wrong
+    #[arg(long)]
+    keep: bool,
+}
+
+fn main() -> ExitCode {
+    match CommandLine::parse().command {
+        Command::Run(arguments) => match run(&arguments) {
+            Ok(true) => ExitCode::SUCCESS,
+            Ok(false) => ExitCode::from(FAILED),
+            Err(error) => {
+                eprintln!("error: {error:#}");
+                ExitCode::from(MISSING)
+            }
+        },
+        Command::List { plan, root } => match real::expected(&root.join("proof/expected.toml")) {
+            Ok(real) => {
+                for planned in plan::plan(plan, &real) {
+                    println!("{}", planned.case.id);
+                }
+                ExitCode::SUCCESS
+            }
+            Err(error) => {
+                eprintln!("error: {error:#}");
+                ExitCode::from(MISSING)
+            }
+        },
+    }
+}
+
+fn run(arguments: &Run) -> Result<bool> {
+    let absolute =
+        |path: &PathBuf| std::path::absolute(path).with_context(|| path.display().to_string());
+    let root = absolute(&arguments.root)?;
+    let real = real::expected(&root.join("proof/expected.toml"))?;
+    let mut plan = plan::plan(arguments.plan, &real);
+    if let Some(part) = &arguments.only {
+        plan.retain(|planned| planned.case.id.contains(part.as_str()));
+    }
+    let board = match (&arguments.emulate, &arguments.image) {
+        (Some(emulate), Some(image)) => Some(Board {
+            emulate: absolute(emulate)?,
+            image: absolute(image)?,
+        }),
+        _ => None,
+    };
+    // The interpreter of an environment is a link; its path is what makes it that environment's.
+    let python = if arguments.python.components().count() > 1 {
+        absolute(&arguments.python)?
+    } else {
+        arguments.python.clone()
+    };
+    let workers = match arguments.workers {
+        Some(workers) => workers.max(1),
+        None => thread::available_parallelism().map_or(1, usize::from),
+    };
+    let campaign = Campaign {
+        out: absolute(&arguments.out)?,
+        tool: Tool {
+            program: absolute(&arguments.twin)?,
+            threads: 1,
+        },
+        makers: Makers {
+            python: python.clone(),
+            folder: match &arguments.makers {
+                Some(folder) => absolute(folder)?,
+                None => root.join("proof/makers"),
+            },
+        },
+        methods: Methods {
+            python,
+            folder: match &arguments.methods {
+                Some(folder) => absolute(folder)?,
+                None => root.join("proof/methods"),
+            },
+        },
+        board,
+        real,
+        workers,
+        keep: arguments.keep,
+        root,
+    };
+    let records = campaign.run(&plan)?;
+    let extent = match arguments.plan {
+        Extent::Quick => "quick",
+        Extent::Full => "full",
+    };
+    let processors = thread::available_parallelism().map_or(1, usize::from);
+    let summary = summary::summary(
+        &records,
+        extent,
+        seal::hash_file(&campaign.tool.program)?,
+        processors,
+    );
+    let pages = match &arguments.docs {
+        Some(docs) => absolute(docs)?,
+        None => campaign.out.join("pages"),
+    };
+    fs::create_dir_all(&pages).with_context(|| format!("making {}", pages.display()))?;
+    let results = pages.join("results.json");
+    fs::write(&results, results::text(&summary)?)
+        .with_context(|| format!("writing {}", results.display()))?;
+    let mut pictures = process::Command::new(&campaign.makers.python);
+    pictures
+        .arg("-B")
+        .arg(campaign.root.join("proof/pictures.py"))
+        .arg(&results)
+        .arg(&pages);
+    program::run(&mut pictures, Duration::from_secs(120)).context("proof/pictures.py")?;
+    pages::write(&summary, &pages)?;
+    for target in &summary.targets {
+        let met = match target.met {
+            Some(true) => "met",
+            Some(false) => "MISSED",
+            None => "",
+        };
+        println!(
+            "{:<6} {}: {} (wanted {})",
+            met, target.what, target.found, target.wanted
+        );
+    }
+    println!("{}", pages.join("index.md").display());
+    if arguments.plan == Extent::Full || arguments.only.is_some() {
+        return Ok(true);
+    }
+    let broken = bounds::broken(&summary, &records);
+    for one in &broken {
+        eprintln!("does not hold: {one}");
+    }
+    Ok(broken.is_empty())
+}

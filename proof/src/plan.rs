@@ -1,0 +1,843 @@
+//! The list of cases: the same on every machine and in every run.
+
+use serde_json::{Map, Value, json};
+
+use crate::{
+    case::{Case, Concealed, Group, Planned},
+    real::Expected,
+};
+
+/// Effects of the sensing chain, by the library's ids.
+const SENSING: [&str; 20] = [
+    "offset",
+    "gain",
+    "offset-temperature",
+    "gain-temperature",
+    "supply-ratiometric",
+    "core-hysteresis",
+    "core-saturation",
+    "clipping",
+    "lag",
+    "moving-average",
+    "delay",
+    "clock-skew",
+    "hum",
+    "quantisation",
+    "dead-band",
+    "range-handover",
+    "range-mismatch",
+    "sensor-self-heating",
+    "stray-field",
+    "sampled-window",
+];
+
+/// Effects of charge and battery.
+const BATTERY: [&str; 10] = [
+    "coulombic-efficiency",
+    "parasitic-load",
+    "capacity",
+    "polarisation",
+    "diffusion",
+    "ocv-hysteresis",
+    "resistance-temperature",
+    "resistance-soc",
+    "cell-self-heating",
+    "entropic",
+];
+
+/// Around the detection limit: 1 is just visible.
+const STRENGTHS: [f64; 5] = [0.3, 1.0, 3.0, 10.0, 30.0];
+/// What is added to the reading.
+const NOISES: [&str; 3] = ["white", "coloured", "quantised"];
+/// A car on a fast and on a slow cycle, and the switched load of a computer.
+const DRIVES: [&str; 3] = ["us06", "hwfet", "gpu"];
+/// Drives of the battery's makers.
+const CELL_DRIVES: [&str; 2] = ["us06", "hwfet"];
+/// Rows of a case of the sensing chain: ten minutes at 10 Hz.
+const ROWS: usize = 6000;
+/// Rows of a circuit: five minutes.
+const CIRCUIT_ROWS: usize = 3000;
+/// Rows of a Doyle–Fuller–Newman cell, which takes a third of a minute for 6,000.
+const DFN_ROWS: usize = 2400;
+/// Rows of a case of the battery: half an hour, two rows a second.
+const BATTERY_ROWS: usize = 3600;
+
+/// Effects that show between rows of 0.1 s: for them the drive is also recorded every 10 ms.
+const FAST: [&str; 5] = [
+    "lag",
+    "moving-average",
+    "delay",
+    "sampled-window",
+    "range-handover",
+];
+
+/// Physics that the library lacks (proof/makers/sensing.py).
+const OUTSIDE: [&str; 8] = [
+    "eddy-current",
+    "creep",
+    "aux-squared",
+    "quadratic",
+    "cubic",
+    "gain-step",
+    "random-walk",
+    "missing-codes",
+];
+
+/// The same of batteries (proof/makers/battery.py).
+const BATTERY_OUTSIDE: [&str; 5] = [
+    "voltage-gain",
+    "contact-resistance-rise",
+    "loose-contact",
+    "ocv-step",
+    "charge-resistance",
+];
+
+/// Circuits (proof/makers/circuits.py); the last three are not in the library.
+const CIRCUITS: [&str; 23] = [
+    "lag",
+    "gain",
+    "offset",
+    "clipping",
+    "diode-clamp",
+    "hum",
+    "offset-temperature",
+    "gain-temperature",
+    "sensor-self-heating",
+    "supply-ratiometric",
+    "core-saturation",
+    "core-hysteresis",
+    "core-preisach",
+    "delay",
+    "moving-average",
+    "sampled-window",
+    "range-mismatch",
+    "range-handover",
+    "stray-field",
+    "dead-band",
+    "eddy-current",
+    "resonance",
+    "crossover",
+];
+
+/// What stands still, and the effect that something else then looks the same as.
+const INSEPARABLE: [(&str, &str); 5] = [
+    ("temperature", "offset-temperature"),
+    ("temperature", "gain-temperature"),
+    ("supply", "supply-ratiometric"),
+    ("aux", "stray-field"),
+    ("range", "range-mismatch"),
+];
+
+/// Pairs and triples in which one effect hides another.
+const COMBINED: [&[&str]; 10] = [
+    &["offset", "core-hysteresis"],
+    &["offset", "gain"],
+    &["lag", "gain"],
+    &["delay", "lag"],
+    &["gain", "gain-temperature"],
+    &["range-mismatch", "offset"],
+    &["stray-field", "offset-temperature"],
+    &["gain", "lag", "offset"],
+    &["core-saturation", "gain", "stray-field"],
+    &["supply-ratiometric", "offset-temperature", "delay"],
+];
+
+/// The same of batteries.
+const COMBINED_BATTERY: [&[&str]; 5] = [
+    &["polarisation", "ocv-hysteresis"],
+    &["diffusion", "resistance-temperature"],
+    &["capacity", "resistance-soc"],
+    &["entropic", "resistance-temperature"],
+    &["polarisation", "resistance-soc", "entropic"],
+];
+
+/// What people use today, by the names of proof/methods/run.py.
+const METHODS: [&str; 7] = [
+    "straight-line",
+    "bic",
+    "bic-ar1",
+    "pysindy",
+    "gaussian-process",
+    "all-at-once",
+    "pybop",
+];
+
+/// How much of the campaign.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Extent {
+    /// A fixed small part of it, for the tests.
+    Quick,
+    /// All.
+    Full,
+}
+
+/// A case of the sensing chain or of another maker.
+struct New<'a> {
+    group: Group,
+    maker: &'a str,
+    effects: &'a [&'a str],
+    strength: f64,
+    noise: &'a str,
+    drive: &'a str,
+    seed: u64,
+    rows: usize,
+    options: Map<String, Value>,
+}
+
+impl New<'_> {
+    fn planned(self) -> Planned {
+        let effects: Vec<Concealed> = self
+            .effects
+            .iter()
+            .map(|id| Concealed {
+                id: (*id).to_owned(),
+                strength: self.strength,
+            })
+            .collect();
+        let mut words = vec![self.maker.to_owned()];
+        match effects.as_slice() {
+            [] => words.push("clean".to_owned()),
+            effects => {
+                words.extend(effects.iter().map(|effect| effect.id.clone()));
+                words.push(self.strength.to_string());
+            }
+        }
+        words.extend([
+            self.noise.to_owned(),
+            self.drive.to_owned(),
+            self.seed.to_string(),
+        ]);
+        for value in self.options.values() {
+            words.push(match value {
+                Value::String(word) => word.clone(),
+                Value::Array(list) => list
+                    .iter()
+                    .filter_map(Value::as_str)
+                    .collect::<Vec<_>>()
+                    .join("-"),
+                other => other.to_string(),
+            });
+        }
+        Planned {
+            group: self.group,
+            case: Case {
+                id: words.join("_"),
+                maker: self.maker.to_owned(),
+                effects,
+                noise: self.noise.to_owned(),
+                drive: self.drive.to_owned(),
+                seed: self.seed,
+                rows: self.rows,
+                options: self.options,
+            },
+            without: false,
+            twice: false,
+            methods: Vec::new(),
+        }
+    }
+}
+
+fn options(value: Value) -> Map<String, Value> {
+    match value {
+        Value::Object(map) => map,
+        _ => Map::new(),
+    }
+}
+
+/// PyBOP knows nothing but cells.
+fn all_methods(battery: bool) -> Vec<String> {
+    METHODS
+        .iter()
+        .filter(|name| battery || **name != "pybop")
+        .map(|name| (*name).to_owned())
+        .collect()
+}
+
+/// Every case of the full campaign, in the order in which it runs: the long ones first.
+fn full(real: &[Expected]) -> Vec<Planned> {
+    let mut plan = Vec::new();
+    for one in real {
+        plan.push(Planned {
+            group: Group::Real,
+            case: Case {
+                id: format!("real_{}", one.id),
+                maker: String::new(),
+                effects: Vec::new(),
+                noise: "none".to_owned(),
+                drive: one.id.clone(),
+                seed: 0,
+                rows: 0,
+                options: Map::new(),
+            },
+            without: false,
+            twice: false,
+            // They read one file, with one clock.
+            methods: if one.two_clocks() {
+                Vec::new()
+            } else {
+                all_methods(one.battery)
+            },
+        });
+    }
+    plan.extend(crate::board::plan());
+    plan.extend(others());
+    plan.extend(combined());
+    plan.extend(clean());
+    plan.extend(outside());
+    plan.extend(inseparable());
+    plan.extend(single_battery());
+    plan.extend(single_sensing());
+    plan
+}
+
+/// Simulators that others wrote.
+fn others() -> Vec<Planned> {
+    let mut plan = cells();
+    let circuit = |group, effects: &[&str], strength, noise, drive, seed| {
+        New {
+            group,
+            maker: "circuits",
+            effects,
+            strength,
+            noise,
+            drive,
+            seed,
+            rows: CIRCUIT_ROWS,
+            options: Map::new(),
+        }
+        .planned()
+    };
+    for effect in CIRCUITS {
+        for (strength, noise, drive) in [
+            (3.0, "white", "us06"),
+            (10.0, "white", "us06"),
+            (10.0, "coloured", "us06"),
+            (10.0, "quantised", "us06"),
+            (10.0, "white", "hwfet"),
+            (30.0, "white", "us06"),
+        ] {
+            let mut planned = circuit(Group::Circuits, &[effect], strength, noise, drive, 1);
+            if (strength, noise, drive) == (10.0, "white", "us06") {
+                planned.methods = all_methods(false);
+            }
+            plan.push(planned);
+        }
+    }
+    for noise in NOISES {
+        for drive in CELL_DRIVES {
+            for seed in 1..=8 {
+                let mut planned = circuit(Group::Clean, &[], f64::INFINITY, noise, drive, seed);
+                if seed == 1 {
+                    planned.methods = all_methods(false);
+                }
+                plan.push(planned);
+            }
+        }
+    }
+    plan
+}
+
+/// Cells by PyBaMM.
+fn cells() -> Vec<Planned> {
+    let cell = |effects: &[&str], strength, drive, more: Value| {
+        New {
+            group: Group::Cells,
+            maker: "cells",
+            effects,
+            strength,
+            noise: "white",
+            drive,
+            seed: 1,
+            rows: if more.get("model") == Some(&json!("dfn")) {
+                DFN_ROWS
+            } else {
+                BATTERY_ROWS
+            },
+            options: options(more),
+        }
+        .planned()
+    };
+    let mut plan = Vec::new();
+    // What such a cell has by nature, beside open-circuit voltage and one resistance.
+    for model in ["spme", "dfn"] {
+        for drive in CELL_DRIVES {
+            let mut warm = cell(&["diffusion"], 10.0, drive, json!({ "model": model }));
+            warm.methods = all_methods(true);
+            plan.push(warm);
+            for temperature_c in [0, 10, 40] {
+                plan.push(cell(
+                    &["diffusion", "resistance-temperature"],
+                    10.0,
+                    drive,
+                    json!({ "model": model, "temperature_c": temperature_c }),
+                ));
+            }
+        }
+    }
+    for drive in CELL_DRIVES {
+        plan.push(cell(
+            &["diffusion"],
+            10.0,
+            drive,
+            json!({ "model": "spme", "thermal": "lumped" }),
+        ));
+    }
+    // One effect more, beside a circuit that was fitted to another stretch of driving.
+    for effect in [
+        "resistance-temperature",
+        "entropic",
+        "ocv-hysteresis",
+        "capacity",
+        "parasitic-load",
+        "offset",
+    ] {
+        for (strength, drive) in [(10.0, "hwfet"), (30.0, "hwfet"), (30.0, "us06")] {
+            plan.push(cell(&[effect], strength, drive, Value::Null));
+        }
+    }
+    // Only what such a circuit leaves.
+    for drive in CELL_DRIVES {
+        for model in ["spme", "dfn"] {
+            plan.push(cell(&[], f64::INFINITY, drive, json!({ "model": model })));
+        }
+    }
+    plan
+}
+
+/// These show in few rows or none until they are large (proof/makers/README.md).
+const LATE: [&str; 2] = ["sampled-window", "range-handover"];
+/// For them.
+const LATE_STRENGTHS: [f64; 2] = [100.0, 300.0];
+
+/// Each effect × strength × noise × drive of the sensing chain.
+fn single_sensing() -> Vec<Planned> {
+    let mut plan = Vec::new();
+    for effect in SENSING {
+        for strength in STRENGTHS {
+            for noise in NOISES {
+                for (place, drive) in DRIVES.into_iter().enumerate() {
+                    plan.push(single(
+                        "sensing", effect, strength, noise, drive, place, ROWS,
+                    ));
+                }
+            }
+            if FAST.contains(&effect) {
+                plan.push(single(
+                    "sensing",
+                    effect,
+                    strength,
+                    "white",
+                    "us06-fast",
+                    3,
+                    ROWS,
+                ));
+            }
+        }
+    }
+    for effect in LATE {
+        for strength in LATE_STRENGTHS {
+            for (place, drive) in CELL_DRIVES.into_iter().enumerate() {
+                plan.push(single(
+                    "sensing", effect, strength, "white", drive, place, ROWS,
+                ));
+            }
+        }
+    }
+    plan
+}
+
+/// The same of the battery, for which there are two drives.
+fn single_battery() -> Vec<Planned> {
+    let mut plan = Vec::new();
+    for effect in BATTERY {
+        for strength in STRENGTHS {
+            for noise in NOISES {
+                for (place, drive) in CELL_DRIVES.into_iter().enumerate() {
+                    if place == 0 || noise == "white" {
+                        plan.push(single(
+                            "battery",
+                            effect,
+                            strength,
+                            noise,
+                            drive,
+                            place,
+                            BATTERY_ROWS,
+                        ));
+                    }
+                }
+            }
+        }
+    }
+    plan
+}
+
+fn single(
+    maker: &str,
+    effect: &str,
+    strength: f64,
+    noise: &str,
+    drive: &str,
+    place: usize,
+    rows: usize,
+) -> Planned {
+    let mut planned = New {
+        group: Group::Single,
+        maker,
+        effects: &[effect],
+        strength,
+        noise,
+        drive,
+        seed: place as u64 + 1,
+        rows,
+        options: Map::new(),
+    }
+    .planned();
+    let usual = strength == 10.0 && noise == "white";
+    planned.without = usual && place < 2;
+    if usual && place == 0 {
+        planned.methods = all_methods(maker == "battery");
+    }
+    planned.twice = usual && place == 0 && effect == "lag";
+    planned
+}
+
+/// Strong enough that what hides the other can be told.
+fn combined() -> Vec<Planned> {
+    let mut plan = Vec::new();
+    for effects in COMBINED {
+        for (noise, drive, strength) in [
+            ("white", "us06", 10.0),
+            ("coloured", "us06", 10.0),
+            ("white", "hwfet", 10.0),
+            ("white", "us06", 3.0),
+        ] {
+            plan.push(
+                New {
+                    group: Group::Combined,
+                    maker: "sensing",
+                    effects,
+                    strength,
+                    noise,
+                    drive,
+                    seed: 1,
+                    rows: ROWS,
+                    options: options(json!({ "masked": true })),
+                }
+                .planned(),
+            );
+        }
+    }
+    for effects in COMBINED_BATTERY {
+        for drive in CELL_DRIVES {
+            plan.push(
+                New {
+                    group: Group::Combined,
+                    maker: "battery",
+                    effects,
+                    strength: 10.0,
+                    noise: "white",
+                    drive,
+                    seed: 1,
+                    rows: BATTERY_ROWS,
+                    options: options(json!({ "masked": true })),
+                }
+                .planned(),
+            );
+        }
+    }
+    plan
+}
+
+fn clean() -> Vec<Planned> {
+    let mut plan = Vec::new();
+    for noise in NOISES {
+        for drive in DRIVES {
+            for seed in 1..=12 {
+                let mut planned = New {
+                    group: Group::Clean,
+                    maker: "sensing",
+                    effects: &[],
+                    strength: f64::INFINITY,
+                    noise,
+                    drive,
+                    seed,
+                    rows: ROWS,
+                    options: Map::new(),
+                }
+                .planned();
+                if seed == 1 {
+                    planned.methods = all_methods(false);
+                }
+                plan.push(planned);
+            }
+        }
+        for drive in CELL_DRIVES {
+            for seed in 1..=5 {
+                plan.push(
+                    New {
+                        group: Group::Clean,
+                        maker: "battery",
+                        effects: &[],
+                        strength: f64::INFINITY,
+                        noise,
+                        drive,
+                        seed,
+                        rows: BATTERY_ROWS,
+                        options: Map::new(),
+                    }
+                    .planned(),
+                );
+            }
+        }
+    }
+    plan
+}
+
+fn outside() -> Vec<Planned> {
+    let mut plan = Vec::new();
+    for effect in BATTERY_OUTSIDE {
+        for drive in CELL_DRIVES {
+            plan.push(
+                New {
+                    group: Group::Outside,
+                    maker: "battery",
+                    effects: &[effect],
+                    strength: 10.0,
+                    noise: "white",
+                    drive,
+                    seed: 1,
+                    rows: BATTERY_ROWS,
+                    options: Map::new(),
+                }
+                .planned(),
+            );
+        }
+    }
+    for effect in OUTSIDE {
+        for (noise, drive, strength) in [
+            ("white", "us06", 3.0),
+            ("white", "us06", 10.0),
+            ("coloured", "us06", 10.0),
+            ("white", "hwfet", 10.0),
+            ("white", "gpu", 10.0),
+        ] {
+            plan.push(
+                New {
+                    group: Group::Outside,
+                    maker: "sensing",
+                    effects: &[effect],
+                    strength,
+                    noise,
+                    drive,
+                    seed: 1,
+                    rows: ROWS,
+                    options: Map::new(),
+                }
+                .planned(),
+            );
+        }
+    }
+    plan
+}
+
+fn inseparable() -> Vec<Planned> {
+    let mut plan = Vec::new();
+    for (still, effect) in INSEPARABLE {
+        for drive in ["us06", "hwfet"] {
+            plan.push(
+                New {
+                    group: Group::Inseparable,
+                    maker: "sensing",
+                    effects: &[effect],
+                    strength: 10.0,
+                    noise: "white",
+                    drive,
+                    seed: 1,
+                    rows: ROWS,
+                    options: options(json!({ "constant": [still] })),
+                }
+                .planned(),
+            );
+        }
+    }
+    for drive in CELL_DRIVES {
+        plan.push(
+            New {
+                group: Group::Inseparable,
+                maker: "battery",
+                effects: &["offset"],
+                strength: 10.0,
+                noise: "white",
+                drive,
+                seed: 1,
+                rows: BATTERY_ROWS,
+                options: Map::new(),
+            }
+            .planned(),
+        );
+    }
+    for effect in ["gain", "core-saturation"] {
+        plan.push(
+            New {
+                group: Group::Inseparable,
+                maker: "sensing",
+                effects: &[effect],
+                strength: 10.0,
+                noise: "white",
+                drive: "square",
+                seed: 1,
+                rows: ROWS,
+                options: Map::new(),
+            }
+            .planned(),
+        );
+    }
+    plan
+}
+
+/// Whether a case belongs to the small part.
+fn is_quick(planned: &Planned) -> bool {
+    let case = &planned.case;
+    let usual = case.noise == "white" && case.drive == "us06" && case.seed == 1;
+    let has = |ids: &[&str]| {
+        case.effects
+            .iter()
+            .any(|effect| ids.contains(&effect.id.as_str()))
+    };
+    match planned.group {
+        Group::Real => [
+            "gpu-rtx3090-two-clocks",
+            "gpu-rtx3090",
+            "gpu-a100",
+            "gpu-k40m",
+            "nasa-b0053",
+            "bh-ferrite",
+        ]
+        .contains(&case.drive.as_str()),
+        Group::Single if case.maker == "sensing" => usual && case.strength() == 10.0,
+        Group::Single => {
+            usual
+                && case.strength() == 10.0
+                && has(&["capacity", "polarisation", "diffusion", "entropic"])
+        }
+        Group::Clean if case.maker == "battery" => usual,
+        Group::Clean if case.maker == "circuits" => case.seed == 1 && case.drive == "us06",
+        Group::Clean => case.seed == 1,
+        Group::Outside => {
+            usual
+                && case.strength() == 10.0
+                && has(&["creep", "quadratic", "gain-step", "ocv-step"])
+        }
+        Group::Combined => {
+            usual && case.strength() == 10.0 && case.effects.len() == 2 && has(&["lag"])
+        }
+        Group::Inseparable => usual && has(&["offset-temperature"]),
+        Group::Cells => {
+            usual
+                && case.effects.len() == 1
+                && has(&["diffusion"])
+                && case.options.len() == 1
+                && case.options.get("model") == Some(&json!("spme"))
+        }
+        Group::Circuits => {
+            usual
+                && case.strength() == 10.0
+                && has(&["gain", "lag", "core-saturation", "resonance"])
+        }
+        Group::Board => case.drive == "large-gain",
+    }
+}
+
+/// The cases of a campaign.
+pub fn plan(extent: Extent, real: &[Expected]) -> Vec<Planned> {
+    let mut plan = full(real);
+    if extent == Extent::Quick {
+        plan.retain(is_quick);
+        for planned in &mut plan {
+            // Each method on a few; it is the tool that is tested here.
+            let few = planned.group == Group::Real
+                || planned.case.effects.iter().any(|effect| effect.id == "lag");
+            if !few {
+                planned.methods.clear();
+            }
+            planned
+                .methods
+                .retain(|name| ["straight-line", "bic"].contains(&name.as_str()));
+            planned.without &= planned
+                .case
+                .effects
+                .iter()
+                .any(|effect| ["lag", "gain"].contains(&effect.id.as_str()));
+        }
+    }
+    plan
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use std::{collections::HashSet, path::Path};
+
+    use super::*;
+
+    fn real() -> Vec<Expected> {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("expected.toml");
+        crate::real::expected(&file).unwrap()
+    }
+
+    #[test]
+    fn ids_are_unique_and_names_of_folders() {
+        let plan = plan(Extent::Full, &real());
+        let ids: HashSet<&str> = plan.iter().map(|one| one.case.id.as_str()).collect();
+        assert_eq!(ids.len(), plan.len());
+        for id in ids {
+            assert!(
+                id.chars()
+                    .all(|c| c.is_ascii_alphanumeric() || "-_.".contains(c)),
+                "{id}"
+            );
+        }
+    }
+
+    #[test]
+    fn every_effect_meets_every_strength_noise_and_drive() {
+        let plan = plan(Extent::Full, &real());
+        let there = |effect: &str, strength: f64, noise: &str, drive: &str| {
+            plan.iter().any(|one| {
+                let case = &one.case;
+                one.group == Group::Single
+                    && case.effects[0].id == effect
+                    && case.strength() == strength
+                    && (case.noise.as_str(), case.drive.as_str()) == (noise, drive)
+            })
+        };
+        for strength in STRENGTHS {
+            for noise in NOISES {
+                for (effect, drive) in SENSING
+                    .into_iter()
+                    .flat_map(|effect| DRIVES.map(|drive| (effect, drive)))
+                {
+                    assert!(there(effect, strength, noise, drive), "{effect} {drive}");
+                }
+                for effect in BATTERY {
+                    assert!(there(effect, strength, noise, "us06"), "{effect}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_quick_campaign_is_a_small_part_of_the_full_one() {
+        let full: HashSet<String> = plan(Extent::Full, &real())
+            .into_iter()
+            .map(|one| one.case.id)
+            .collect();
+        let quick = plan(Extent::Quick, &real());
+        assert!((30..=80).contains(&quick.len()), "{}", quick.len());
+        assert!(quick.iter().all(|one| full.contains(&one.case.id)));
+        for group in [Group::Real, Group::Single, Group::Clean, Group::Outside] {
+            assert!(quick.iter().any(|one| one.group == group), "{group:?}");
+        }
+    }
+}

@@ -1,0 +1,1053 @@
+//! Tables out of the records. Everything that a page or a picture says is calculated here, and stands in results.json.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Serialize;
+
+use crate::{
+    board::Calibrated,
+    case::{Group, Truth},
+    methods::Found,
+    run::Record,
+    score::{self, Judgement, Outcome, PLAIN},
+    stats::{Share, median, quantile},
+    tool::{Named, Said},
+};
+
+/// Version of results.json.
+const SCHEMA: u32 = 1;
+/// A baseline fits as well as the tool if its held-out error is at most so many times the tool's.
+const AS_WELL: f64 = 1.05;
+/// Two held-out errors within this share of each other are level.
+const LEVEL: f64 = 0.01;
+/// Detected: the lower strengths of an effect are those at which fewer than this share are right.
+const DETECTED: f64 = 0.95;
+
+/// How many of each outcome.
+#[derive(Debug, Clone, Serialize)]
+pub struct Counts {
+    /// a, b, c, d, or a group's title.
+    pub name: String,
+    /// Who made the data.
+    pub makers: Vec<String>,
+    /// The same by its letter.
+    pub kinds: Vec<String>,
+    /// Cases with data.
+    pub cases: usize,
+    /// Of each outcome.
+    pub outcomes: BTreeMap<Outcome, usize>,
+    /// Right name or class, of the cases in which something of the library is hidden at strength 3 or more.
+    pub right: Share,
+    /// Something named that is not there, of all scored.
+    pub wrong: Share,
+    /// And said with confidence.
+    pub confidently_wrong: Share,
+}
+
+/// One line of the confusion matrix.
+#[derive(Debug, Clone, Serialize)]
+pub struct Confusion {
+    /// Kind of the data.
+    pub kind: String,
+    /// Hidden effect.
+    pub effect: String,
+    /// What was said, and how often.
+    pub said: BTreeMap<String, usize>,
+}
+
+/// Shares of right answers of an effect over its strength.
+#[derive(Debug, Clone, Serialize)]
+pub struct Detection {
+    /// Hidden effect.
+    pub effect: String,
+    /// Kind of the data.
+    pub kind: String,
+    /// Strength, share of right names or classes.
+    pub strengths: Vec<(f64, Share)>,
+    /// Smallest strength from which on the share stays at 95 % or more.
+    pub limit: Option<f64>,
+}
+
+/// Errors of one parameter.
+#[derive(Debug, Clone, Serialize)]
+pub struct ParameterLine {
+    /// Kind of the data.
+    pub kind: String,
+    /// Effect.
+    pub effect: String,
+    /// Its parameter.
+    pub name: String,
+    /// Estimates.
+    pub cases: usize,
+    /// Median of the relative error's magnitude.
+    pub median_error: Option<f64>,
+    /// 95 % intervals with the truth in them.
+    pub covered: Share,
+}
+
+/// A real recording.
+#[derive(Debug, Clone, Serialize)]
+pub struct RealLine {
+    /// Of expected.toml.
+    pub id: String,
+    /// published, beside or none.
+    pub standing: String,
+    /// Who says what is right.
+    pub source: String,
+    /// What has to be named.
+    pub required: Vec<Vec<String>>,
+    /// How it went.
+    pub outcome: Outcome,
+    /// And with confidence.
+    pub confident: bool,
+    /// Of the report.
+    pub verdict: String,
+    /// What was named, with its equals.
+    pub named: Vec<Named>,
+    /// Published parameter, and what was said of it.
+    pub published: Vec<PublishedLine>,
+    /// Of the model as designed, on what was not fitted.
+    pub before: Option<f64>,
+    /// Of the extended model.
+    pub after: Option<f64>,
+    /// Unit of the two.
+    pub signal: String,
+    /// Processor time of the explanation, s.
+    pub processor_s: Option<f64>,
+    /// Today's methods.
+    pub methods: BTreeMap<String, Found>,
+    /// The failure, if it failed.
+    pub error: Option<String>,
+}
+
+/// A published parameter beside the reported one.
+#[derive(Debug, Clone, Serialize)]
+pub struct PublishedLine {
+    /// Effect and parameter.
+    pub name: String,
+    /// As published.
+    pub published: f64,
+    /// What is right.
+    pub low: f64,
+    /// Its upper end.
+    pub high: f64,
+    /// As said; nothing if the effect was not named.
+    pub said: Option<f64>,
+    /// 95 % interval.
+    pub interval: Option<(f64, f64)>,
+}
+
+/// One of today's methods, beside the tool on the same cases.
+#[derive(Debug, Clone, Serialize)]
+pub struct MethodLine {
+    /// Who made the data: "(a) and (b)" or "(c) and (d)".
+    pub data: String,
+    /// Its name; `twin` on the same cases.
+    pub name: String,
+    /// Cases it was run on and has something to say about.
+    pub cases: usize,
+    /// Right names or classes, of those with a hidden effect.
+    pub right: Share,
+    /// Wrong names, of the same.
+    pub wrong: Share,
+    /// Something named though nothing is hidden.
+    pub false_alarms: Share,
+    /// Median of held-out error over that of the true model.
+    pub over_oracle: Option<f64>,
+    /// Median processor time, s.
+    pub seconds: Option<f64>,
+    /// Failed.
+    pub errors: usize,
+    /// What a method names is part of a linear or black-box model that names nothing.
+    pub names_effects: bool,
+}
+
+/// The emulated board.
+#[derive(Debug, Clone, Serialize)]
+pub struct BoardLine {
+    /// What was concealed.
+    pub concealed: String,
+    /// How it went.
+    pub outcome: Option<Outcome>,
+    /// What was named.
+    pub named: Vec<Named>,
+    /// The second drive with and without the calibration.
+    pub calibrated: Option<Calibrated>,
+    /// What failed.
+    pub error: Option<String>,
+}
+
+/// A figure that the project wants to reach.
+#[derive(Debug, Clone, Serialize)]
+pub struct Target {
+    /// In words.
+    pub what: String,
+    /// What it should be.
+    pub wanted: String,
+    /// What it is.
+    pub found: String,
+    /// Whether it is reached; nothing if it was not measured.
+    pub met: Option<bool>,
+}
+
+/// Clean recordings.
+#[derive(Debug, Clone, Serialize)]
+pub struct Clean {
+    /// Kind of the data.
+    pub kind: String,
+    /// An effect was named.
+    pub named: Share,
+    /// Anything but "no mismatch" was said.
+    pub anything: Share,
+}
+
+/// Everything.
+#[derive(Debug, Serialize)]
+pub struct Summary {
+    /// Of this file.
+    pub schema: u32,
+    /// quick or full.
+    pub plan: String,
+    /// SHA-256 of the program under test.
+    pub tool_sha256: String,
+    /// Processors of the machine.
+    pub processors: usize,
+    /// Cases of the plan.
+    pub cases: usize,
+    /// Seconds of the wall clock that each part took in all, on one processor.
+    pub parts_s: BTreeMap<String, f64>,
+    /// Without data, by the maker's own limits: id and reason.
+    pub not_made: Vec<(String, String)>,
+    /// Failed: id and reason.
+    pub errors: Vec<(String, String)>,
+    /// By who made the data.
+    pub by_kind: Vec<Counts>,
+    /// By what the cases are for.
+    pub by_group: Vec<Counts>,
+    /// Real recordings and other people's simulators together.
+    pub others_together: Counts,
+    /// Strength 3 and more.
+    pub confusion: Vec<Confusion>,
+    /// Over the strengths.
+    pub detection: Vec<Detection>,
+    /// Of single hidden effects.
+    pub parameters: Vec<ParameterLine>,
+    /// All intervals together, by kind.
+    pub coverage: BTreeMap<String, Share>,
+    /// Overlap of the place by kind: count, quartiles.
+    pub overlap: BTreeMap<String, (usize, f64, f64, f64)>,
+    /// Held-out error over the oracle's by kind: count, median, 90 %, share within 1.1.
+    pub over_oracle: BTreeMap<String, (usize, f64, f64, Share)>,
+    /// By kind.
+    pub clean: Vec<Clean>,
+    /// With the true effect taken out: outcomes.
+    pub without: Counts,
+    /// Every real recording.
+    pub real: Vec<RealLine>,
+    /// Side by side.
+    pub methods: Vec<MethodLine>,
+    /// Of real recordings, a method is lower held out (1 % or more): id, method.
+    pub beaten_on_real: Vec<(String, String)>,
+    /// The same, neither lower nor higher by 1 %.
+    pub level_on_real: Vec<(String, String)>,
+    /// Time of the fastest method that names an effect rightly and fits as well, over the tool's; median, count.
+    pub speed: Option<(f64, usize)>,
+    /// The emulated board.
+    pub board: Vec<BoardLine>,
+    /// Same input, same report.
+    pub same: Option<bool>,
+    /// Figures to reach.
+    pub targets: Vec<Target>,
+    /// One short line a case.
+    pub records: Vec<Line>,
+}
+
+/// A case in short.
+#[derive(Debug, Clone, Serialize)]
+pub struct Line {
+    /// Unique.
+    pub id: String,
+    /// What it is for.
+    pub group: Group,
+    /// Who made the data.
+    pub kind: String,
+    /// How it went.
+    pub outcome: Option<Outcome>,
+    /// Wrong and confident.
+    pub confident: bool,
+    /// Of the report.
+    pub verdict: String,
+    /// Ids; equals behind a slash.
+    pub named: Vec<String>,
+    /// Of the truth.
+    pub truth: Vec<String>,
+    /// SHA-256 of the sealed truth.
+    pub sealed: String,
+    /// Held out: as designed, extended, true model.
+    pub held_out: Option<(f64, f64, Option<f64>)>,
+    /// Of the place.
+    pub overlap: Option<f64>,
+    /// Processor time, s.
+    pub processor_s: Option<f64>,
+    /// How it went with the true effect taken out.
+    pub without: Option<Outcome>,
+}
+
+/// A record with its truth and judgement.
+struct Scored<'a> {
+    record: &'a Record,
+    truth: &'a Truth,
+    judged: Judgement,
+}
+
+impl Scored<'_> {
+    fn hidden(&self) -> bool {
+        !self.truth.required.is_empty()
+    }
+
+    fn strength(&self) -> f64 {
+        self.truth.strength(self.record.planned.case.strength())
+    }
+
+    fn plain(&self) -> bool {
+        self.strength() >= PLAIN
+    }
+}
+
+/// Counts the outcomes of some cases.
+fn counts<'a>(name: &str, cases: impl Iterator<Item = (&'a Scored<'a>, Judgement)>) -> Counts {
+    let cases: Vec<_> = cases.collect();
+    let mut outcomes = BTreeMap::new();
+    let (mut makers, mut kinds) = (BTreeSet::new(), BTreeSet::new());
+    for (one, judged) in &cases {
+        kinds.insert(one.truth.kind.clone());
+        *outcomes.entry(judged.outcome).or_insert(0) += 1;
+        makers.insert(one.truth.maker.clone());
+    }
+    let scored = || {
+        cases
+            .iter()
+            .filter(|(_, judged)| judged.outcome != Outcome::Unscored)
+    };
+    Counts {
+        name: name.to_owned(),
+        makers: makers.into_iter().collect(),
+        kinds: kinds.into_iter().collect(),
+        cases: cases.len(),
+        outcomes,
+        right: Share::of(
+            scored().filter(|(one, _)| one.hidden() && one.plain()),
+            |(_, judged)| judged.outcome.right(),
+        ),
+        wrong: Share::of(scored(), |(_, judged)| judged.outcome == Outcome::Wrong),
+        confidently_wrong: Share::of(scored(), |(_, judged)| judged.confident),
+    }
+}
+
+/// What a kind's letter stands for.
+pub fn kind_title(kind: &str) -> &'static str {
+    match kind {
+        "a" => "(a) real recordings",
+        "b" => "(b) simulators that others wrote",
+        "c" => "(c) others' solver, our equations",
+        _ => "(d) our own",
+    }
+}
+
+/// Every table.
+pub fn summary(records: &[Record], plan: &str, tool_sha256: String, processors: usize) -> Summary {
+    let scored: Vec<Scored<'_>> = records
+        .iter()
+        .filter_map(|record| {
+            Some(Scored {
+                record,
+                truth: record.truth.as_ref()?,
+                judged: record.judgement()?,
+            })
+        })
+        .collect();
+    let with = |keep: &dyn Fn(&Scored<'_>) -> bool, name: &str| {
+        counts(
+            name,
+            scored
+                .iter()
+                .filter(|one| keep(one))
+                .map(|one| (one, one.judged.clone())),
+        )
+    };
+    let kinds: BTreeSet<&str> = scored.iter().map(|one| one.truth.kind.as_str()).collect();
+    let by_kind: Vec<Counts> = kinds
+        .iter()
+        .map(|kind| with(&|one| one.truth.kind == **kind, kind))
+        .collect();
+    let by_group = Group::ALL
+        .into_iter()
+        .map(|group| with(&|one| one.record.planned.group == group, group.title()))
+        .filter(|counts| counts.cases > 0)
+        .collect();
+    let others_together = with(
+        &|one| ["a", "b"].contains(&one.truth.kind.as_str()),
+        "(a) and (b) together",
+    );
+    let without = counts(
+        "true effect taken out of the library",
+        scored
+            .iter()
+            .filter_map(|one| Some((one, one.record.judgement_without()?))),
+    );
+    let mut summary = Summary {
+        schema: SCHEMA,
+        plan: plan.to_owned(),
+        tool_sha256,
+        processors,
+        cases: records.len(),
+        parts_s: parts(records),
+        not_made: records
+            .iter()
+            .filter_map(|record| Some((record.planned.case.id.clone(), record.not_made.clone()?)))
+            .collect(),
+        errors: records
+            .iter()
+            .filter_map(|record| Some((record.planned.case.id.clone(), record.error.clone()?)))
+            .collect(),
+        by_kind,
+        by_group,
+        others_together,
+        confusion: confusion(&scored),
+        detection: detection(&scored),
+        parameters: parameters(&scored),
+        coverage: coverage(&scored),
+        overlap: overlap(&scored),
+        over_oracle: over_oracle(&scored),
+        clean: clean(&scored),
+        without,
+        real: real(&scored),
+        methods: methods(&scored),
+        beaten_on_real: against_methods(&scored, |ratio| ratio < 1.0 - LEVEL),
+        level_on_real: against_methods(&scored, |ratio| (ratio - 1.0).abs() <= LEVEL),
+        speed: speed(&scored),
+        board: board(records),
+        same: records
+            .iter()
+            .filter_map(|record| record.same)
+            .reduce(|all, one| all && one),
+        targets: Vec::new(),
+        records: records.iter().map(line).collect(),
+    };
+    summary.targets = targets(&summary);
+    summary
+}
+
+fn parts(records: &[Record]) -> BTreeMap<String, f64> {
+    let mut all = BTreeMap::new();
+    for (part, seconds) in records.iter().flat_map(|record| &record.parts_s) {
+        *all.entry(part.clone()).or_insert(0.0) += seconds;
+    }
+    all
+}
+
+fn confusion(scored: &[Scored<'_>]) -> Vec<Confusion> {
+    let mut lines: BTreeMap<(String, String), BTreeMap<String, usize>> = BTreeMap::new();
+    for one in scored {
+        let case = &one.record.planned.case;
+        if case.effects.len() != 1 || !one.plain() || one.record.planned.group == Group::Inseparable
+        {
+            continue;
+        }
+        let line = lines
+            .entry((one.truth.kind.clone(), case.effects[0].id.clone()))
+            .or_default();
+        *line.entry(one.judged.said.clone()).or_insert(0) += 1;
+    }
+    lines
+        .into_iter()
+        .map(|((kind, effect), said)| Confusion { kind, effect, said })
+        .collect()
+}
+
+fn detection(scored: &[Scored<'_>]) -> Vec<Detection> {
+    let mut effects: BTreeMap<(String, String), Vec<(f64, bool)>> = BTreeMap::new();
+    for one in scored {
+        let case = &one.record.planned.case;
+        if one.record.planned.group == Group::Single && case.effects.len() == 1 {
+            effects
+                .entry((one.truth.kind.clone(), case.effects[0].id.clone()))
+                .or_default()
+                .push((case.strength(), one.judged.outcome.right()));
+        }
+    }
+    effects
+        .into_iter()
+        .map(|((kind, effect), cases)| {
+            let mut used: Vec<f64> = cases.iter().map(|(strength, _)| *strength).collect();
+            used.sort_by(f64::total_cmp);
+            used.dedup();
+            let strengths: Vec<(f64, Share)> = used
+                .into_iter()
+                .map(|strength| {
+                    let of_it = cases.iter().filter(|(s, _)| *s == strength);
+                    (strength, Share::of(of_it, |(_, right)| *right))
+                })
+                .collect();
+            let mut limit = None;
+            for (strength, share) in strengths.iter().rev() {
+                if share.value() < DETECTED {
+                    break;
+                }
+                limit = Some(*strength);
+            }
+            Detection {
+                effect,
+                kind,
+                strengths,
+                limit,
+            }
+        })
+        .collect()
+}
+
+/// Estimates of cases that were named rightly; a wrong model's parameters mean something else.
+fn right_estimates<'a>(
+    scored: &'a [Scored<'_>],
+) -> impl Iterator<Item = (&'a str, score::Estimate)> {
+    scored
+        .iter()
+        .filter(|one| one.judged.outcome.right())
+        .filter_map(|one| Some((one.truth, one.record.said.as_ref()?)))
+        .flat_map(|(truth, said)| {
+            score::estimates(truth, said)
+                .into_iter()
+                .map(|estimate| (truth.kind.as_str(), estimate))
+        })
+}
+
+fn parameters(scored: &[Scored<'_>]) -> Vec<ParameterLine> {
+    let mut lines: BTreeMap<(String, String, String), Vec<score::Estimate>> = BTreeMap::new();
+    for (kind, estimate) in right_estimates(scored) {
+        lines
+            .entry((
+                kind.to_owned(),
+                estimate.effect.clone(),
+                estimate.name.clone(),
+            ))
+            .or_default()
+            .push(estimate);
+    }
+    lines
+        .into_iter()
+        .map(|((kind, effect, name), estimates)| {
+            // A gain's error counts against its distance from 1, what it would be without the effect.
+            let off = if name == "gain" || name == "gain_ratio" {
+                1.0
+            } else {
+                0.0
+            };
+            let errors: Vec<f64> = estimates
+                .iter()
+                .filter(|one| one.truth != off)
+                .map(|one| ((one.value - one.truth) / (one.truth - off)).abs())
+                .collect();
+            ParameterLine {
+                kind,
+                effect,
+                name,
+                cases: estimates.len(),
+                median_error: median(&errors),
+                covered: Share::of(estimates.iter().filter_map(|one| one.covered), |covered| {
+                    *covered
+                }),
+            }
+        })
+        .collect()
+}
+
+fn coverage(scored: &[Scored<'_>]) -> BTreeMap<String, Share> {
+    let mut kinds: BTreeMap<String, Vec<bool>> = BTreeMap::new();
+    for (kind, estimate) in right_estimates(scored) {
+        if let Some(covered) = estimate.covered {
+            kinds.entry(kind.to_owned()).or_default().push(covered);
+        }
+    }
+    kinds
+        .into_iter()
+        .map(|(kind, covered)| (kind, Share::of(covered, |one| *one)))
+        .collect()
+}
+
+/// Figures of some cases, by kind.
+fn by_kind(
+    scored: &[Scored<'_>],
+    figure: impl Fn(&Scored<'_>) -> Option<f64>,
+) -> BTreeMap<String, Vec<f64>> {
+    let mut kinds: BTreeMap<String, Vec<f64>> = BTreeMap::new();
+    for one in scored {
+        if let Some(value) = figure(one) {
+            kinds.entry(one.truth.kind.clone()).or_default().push(value);
+        }
+    }
+    kinds
+}
+
+fn overlap(scored: &[Scored<'_>]) -> BTreeMap<String, (usize, f64, f64, f64)> {
+    by_kind(scored, |one| {
+        let counts = one.plain() && one.judged.outcome.right();
+        one.record.overlap.filter(|_| counts)
+    })
+    .into_iter()
+    .filter_map(|(kind, values)| {
+        let quartiles = (
+            values.len(),
+            quantile(&values, 0.25)?,
+            median(&values)?,
+            quantile(&values, 0.75)?,
+        );
+        Some((kind, quartiles))
+    })
+    .collect()
+}
+
+/// Held-out error over that of the true model.
+fn ratio(one: &Scored<'_>) -> Option<f64> {
+    let oracle = one.truth.oracle_rms.as_ref()?.holdout?;
+    let (_, errors) = one.record.said.as_ref()?.main_held_out()?;
+    (oracle > 0.0).then(|| errors.after / oracle)
+}
+
+fn over_oracle(scored: &[Scored<'_>]) -> BTreeMap<String, (usize, f64, f64, Share)> {
+    by_kind(scored, |one| {
+        ratio(one).filter(|_| one.hidden() && one.plain())
+    })
+    .into_iter()
+    .filter_map(|(kind, ratios)| {
+        let figures = (
+            ratios.len(),
+            median(&ratios)?,
+            quantile(&ratios, 0.9)?,
+            Share::of(&ratios, |ratio| **ratio <= 1.1),
+        );
+        Some((kind, figures))
+    })
+    .collect()
+}
+
+fn clean(scored: &[Scored<'_>]) -> Vec<Clean> {
+    let of = |kinds: &[&str], name: &str| {
+        let cases = || {
+            scored.iter().filter(|one| {
+                one.record.planned.group == Group::Clean && kinds.contains(&one.truth.kind.as_str())
+            })
+        };
+        Clean {
+            kind: name.to_owned(),
+            named: Share::of(cases(), |one| one.judged.outcome == Outcome::Wrong),
+            anything: Share::of(cases(), |one| one.judged.outcome != Outcome::Quiet),
+        }
+    };
+    ["b", "c", "d"]
+        .into_iter()
+        .map(|kind| of(&[kind], kind))
+        .filter(|line| line.named.of > 0)
+        .collect()
+}
+
+fn real(scored: &[Scored<'_>]) -> Vec<RealLine> {
+    scored
+        .iter()
+        .filter(|one| one.record.planned.group == Group::Real)
+        .map(|one| {
+            let said = one.record.said.clone().unwrap_or_default();
+            let main = said
+                .main_held_out()
+                .map(|(name, errors)| (name.to_owned(), errors));
+            RealLine {
+                id: one.record.planned.case.drive.clone(),
+                standing: one.truth.standing.clone().unwrap_or_default(),
+                source: one.truth.why.clone().unwrap_or_default(),
+                required: one.truth.required.clone(),
+                outcome: one.judged.outcome,
+                confident: one.judged.confident,
+                verdict: said.verdict.clone(),
+                published: one
+                    .truth
+                    .published
+                    .iter()
+                    .map(|wanted| {
+                        let found = said
+                            .named
+                            .iter()
+                            .filter(|named| named.id == wanted.effect)
+                            .flat_map(|named| &named.parameters)
+                            .find(|parameter| parameter.name == wanted.name);
+                        PublishedLine {
+                            name: format!("{}.{}", wanted.effect, wanted.name),
+                            published: wanted.value,
+                            low: wanted.low,
+                            high: wanted.high,
+                            said: found.and_then(|parameter| parameter.value),
+                            interval: found
+                                .and_then(|parameter| Some((parameter.low?, parameter.high?))),
+                        }
+                    })
+                    .collect(),
+                before: main.as_ref().map(|(_, errors)| errors.before),
+                after: main.as_ref().map(|(_, errors)| errors.after),
+                signal: main.map(|(name, _)| name).unwrap_or_default(),
+                processor_s: one.record.said.as_ref().map(|said| said.taken.processor_s),
+                named: said.named,
+                methods: one.record.methods.clone(),
+                error: one.record.error.clone(),
+            }
+        })
+        .collect()
+}
+
+/// A method's names as the tool would say them.
+fn as_said(found: &Found) -> Said {
+    Said {
+        verdict: if found.named.is_empty() {
+            "no-mismatch"
+        } else {
+            "explained"
+        }
+        .to_owned(),
+        named: found
+            .named
+            .iter()
+            .map(|id| Named {
+                id: id.clone(),
+                equals: found
+                    .classes
+                    .iter()
+                    .filter(|class| class.contains(id))
+                    .flatten()
+                    .filter(|other| *other != id)
+                    .cloned()
+                    .collect(),
+                ..Named::default()
+            })
+            .collect(),
+        ..Said::default()
+    }
+}
+
+fn applies(found: &Found) -> bool {
+    found.error.is_none() && found.held_out_rms.is_some()
+}
+
+fn methods(scored: &[Scored<'_>]) -> Vec<MethodLine> {
+    let mut lines = methods_on(scored, "(a) and (b)", &["a", "b"]);
+    lines.extend(methods_on(scored, "(c) and (d)", &["c", "d"]));
+    lines
+}
+
+fn methods_on(scored: &[Scored<'_>], data: &str, kinds: &[&str]) -> Vec<MethodLine> {
+    let compared: Vec<&Scored<'_>> = scored
+        .iter()
+        .filter(|one| kinds.contains(&one.truth.kind.as_str()))
+        .filter(|one| one.record.methods.values().any(applies))
+        .collect();
+    let names: BTreeSet<&String> = compared
+        .iter()
+        .flat_map(|one| one.record.methods.keys())
+        .collect();
+    if names.is_empty() {
+        return Vec::new();
+    }
+    let twin: Vec<Compared<'_>> = compared
+        .iter()
+        .map(|one| {
+            let said = one.record.said.as_ref();
+            Compared {
+                scored: one,
+                judged: one.judged.clone(),
+                names: said.is_some_and(|said| !said.named.is_empty()),
+                held_out: said.and_then(|said| Some(said.main_held_out()?.1.after)),
+                seconds: said.map(|said| said.taken.processor_s),
+            }
+        })
+        .collect();
+    let mut lines = vec![method_line(data, "twin", &twin, 0)];
+    for name in names {
+        let mut cases = Vec::new();
+        let mut errors = 0;
+        for one in &compared {
+            let Some(found) = one.record.methods.get(name) else {
+                continue;
+            };
+            errors += usize::from(found.error.is_some());
+            if !applies(found) {
+                continue;
+            }
+            cases.push(Compared {
+                scored: one,
+                judged: score::judge(one.truth, one.strength(), &[], Some(&as_said(found))),
+                names: !found.named.is_empty(),
+                held_out: found.held_out_rms,
+                seconds: found.seconds,
+            });
+        }
+        lines.push(method_line(data, name, &cases, errors));
+    }
+    lines
+}
+
+/// A method, or the tool, on one case.
+struct Compared<'a> {
+    scored: &'a Scored<'a>,
+    judged: Judgement,
+    names: bool,
+    held_out: Option<f64>,
+    seconds: Option<f64>,
+}
+
+fn method_line(data: &str, name: &str, cases: &[Compared<'_>], errors: usize) -> MethodLine {
+    let hidden = || {
+        cases
+            .iter()
+            .filter(|case| case.scored.hidden() && case.judged.outcome != Outcome::Unscored)
+    };
+    let over_oracle: Vec<f64> = cases
+        .iter()
+        .filter_map(|case| Some(case.held_out? / case.scored.truth.oracle_rms.as_ref()?.holdout?))
+        .collect();
+    let seconds: Vec<f64> = cases.iter().filter_map(|case| case.seconds).collect();
+    MethodLine {
+        data: data.to_owned(),
+        name: name.to_owned(),
+        cases: cases.len(),
+        right: Share::of(hidden(), |case| case.judged.outcome.right()),
+        wrong: Share::of(hidden(), |case| case.judged.outcome == Outcome::Wrong),
+        false_alarms: Share::of(
+            cases
+                .iter()
+                .filter(|case| case.scored.record.planned.group == Group::Clean),
+            |case| case.names,
+        ),
+        over_oracle: median(&over_oracle),
+        seconds: median(&seconds),
+        errors,
+        names_effects: cases.iter().any(|case| case.names),
+    }
+}
+
+/// Real recordings and methods whose held-out error over the tool's is as asked for.
+fn against_methods(scored: &[Scored<'_>], asked: impl Fn(f64) -> bool) -> Vec<(String, String)> {
+    let mut found = Vec::new();
+    for one in scored
+        .iter()
+        .filter(|one| one.record.planned.group == Group::Real)
+    {
+        let ours = one
+            .record
+            .said
+            .as_ref()
+            .and_then(|said| Some(said.main_held_out()?.1.after));
+        for (name, method) in &one.record.methods {
+            let Some(theirs) = method.held_out_rms.filter(|_| method.error.is_none()) else {
+                continue;
+            };
+            // A tool that failed is beaten by anything that did not.
+            if asked(ours.map_or(0.0, |ours| theirs / ours)) {
+                found.push((one.record.planned.case.drive.clone(), name.clone()));
+            }
+        }
+    }
+    found
+}
+
+/// Of the cases in which the tool is right and a method is too: the fastest such method's time over the tool's.
+fn speed(scored: &[Scored<'_>]) -> Option<(f64, usize)> {
+    let mut ratios = Vec::new();
+    for one in scored
+        .iter()
+        .filter(|one| one.hidden() && one.judged.outcome.right())
+    {
+        let Some(said) = &one.record.said else {
+            continue;
+        };
+        let Some((_, ours)) = said.main_held_out() else {
+            continue;
+        };
+        let fastest = one
+            .record
+            .methods
+            .values()
+            .filter(|found| applies(found))
+            .filter(|found| {
+                found
+                    .held_out_rms
+                    .is_some_and(|theirs| theirs <= AS_WELL * ours.after)
+            })
+            .filter(|found| {
+                let judged = score::judge(one.truth, one.strength(), &[], Some(&as_said(found)));
+                judged.outcome.right()
+            })
+            .filter_map(|found| found.seconds)
+            .min_by(f64::total_cmp);
+        if let Some(fastest) = fastest
+            && said.taken.processor_s > 0.0
+        {
+            ratios.push(fastest / said.taken.processor_s);
+        }
+    }
+    Some((median(&ratios)?, ratios.len()))
+}
+
+fn board(records: &[Record]) -> Vec<BoardLine> {
+    records
+        .iter()
+        .filter(|record| record.planned.group == Group::Board)
+        .map(|record| BoardLine {
+            concealed: record
+                .planned
+                .case
+                .options
+                .get("sensor")
+                .and_then(|list| list.as_array())
+                .map(|list| {
+                    list.iter()
+                        .filter_map(|one| one.as_str())
+                        .collect::<Vec<_>>()
+                        .join(", ")
+                })
+                .unwrap_or_default(),
+            outcome: record.judgement().map(|judged| judged.outcome),
+            named: record.said.clone().unwrap_or_default().named,
+            calibrated: record.calibrated.clone(),
+            error: record.error.clone().or_else(|| record.not_made.clone()),
+        })
+        .collect()
+}
+
+fn line(record: &Record) -> Line {
+    let judged = record.judgement();
+    let said = record.said.clone().unwrap_or_default();
+    let truth = record.truth.clone().unwrap_or_default();
+    Line {
+        id: record.planned.case.id.clone(),
+        group: record.planned.group,
+        kind: truth.kind.clone(),
+        outcome: judged.as_ref().map(|judged| judged.outcome),
+        confident: judged.is_some_and(|judged| judged.confident),
+        verdict: said.verdict.clone(),
+        named: said
+            .named
+            .iter()
+            .map(|named| {
+                let mut all = vec![named.id.clone()];
+                all.extend(named.equals.iter().cloned());
+                all.join("/")
+            })
+            .collect(),
+        truth: truth.required.iter().map(|list| list.join("/")).collect(),
+        sealed: record.truth_sha256.clone(),
+        held_out: said.main_held_out().map(|(_, errors)| {
+            let oracle = truth.oracle_rms.as_ref().and_then(|oracle| oracle.holdout);
+            (errors.before, errors.after, oracle)
+        }),
+        overlap: record.overlap,
+        processor_s: record.said.as_ref().map(|said| said.taken.processor_s),
+        without: record.judgement_without().map(|judged| judged.outcome),
+    }
+}
+
+/// 12.3 % (4 of 33; 5 … 27 %).
+pub fn shown(share: &Share) -> String {
+    if share.of == 0 {
+        return "not measured".to_owned();
+    }
+    format!(
+        "{:.1} % ({} of {}; {:.0} … {:.0} %)",
+        100.0 * share.value(),
+        share.count,
+        share.of,
+        100.0 * share.low,
+        100.0 * share.high
+    )
+}
+
+fn targets(summary: &Summary) -> Vec<Target> {
+    let share = |what: &str, wanted: &str, share: &Share, met: bool| Target {
+        what: what.to_owned(),
+        wanted: wanted.to_owned(),
+        found: shown(share),
+        met: (share.of > 0).then_some(met),
+    };
+    let others = &summary.others_together;
+    let mut targets = vec![
+        share(
+            "right id or class, (a) and (b) together",
+            "≥ 90 %",
+            &others.right,
+            others.right.value() >= 0.9,
+        ),
+        share(
+            "confidently wrong, (a) and (b) together",
+            "≤ 3 %",
+            &others.confidently_wrong,
+            others.confidently_wrong.value() <= 0.03,
+        ),
+    ];
+    for line in &summary.clean {
+        targets.push(share(
+            &format!(
+                "false alarms on clean recordings, {}",
+                kind_title(&line.kind)
+            ),
+            "≤ 5 %",
+            &line.anything,
+            line.anything.value() <= 0.05,
+        ));
+    }
+    targets.push(share(
+        "confidently wrong with the true effect taken out, (d)",
+        "≤ 5 %",
+        &summary.without.confidently_wrong,
+        summary.without.confidently_wrong.value() <= 0.05,
+    ));
+    for (kind, covered) in &summary.coverage {
+        targets.push(share(
+            &format!(
+                "95 % intervals with the truth in them, {}",
+                kind_title(kind)
+            ),
+            "90 … 98 %",
+            covered,
+            (0.9..=0.98).contains(&covered.value()),
+        ));
+    }
+    let compared: BTreeSet<&str> = summary
+        .real
+        .iter()
+        .filter(|line| line.methods.values().any(applies))
+        .map(|line| line.id.as_str())
+        .collect();
+    let ids = |list: &[(String, String)]| {
+        list.iter()
+            .map(|(id, _)| id.clone())
+            .collect::<BTreeSet<String>>()
+    };
+    let worse = ids(&summary.beaten_on_real);
+    let level = ids(&summary.level_on_real).difference(&worse).count();
+    targets.push(Target {
+        what: "real recordings on which the held-out error is lower than every baseline's"
+            .to_owned(),
+        wanted: "all".to_owned(),
+        found: format!(
+            "{} of {}; {level} level with the best (within 1 %), {} higher",
+            compared.len() - worse.len() - level,
+            compared.len(),
+            worse.len()
+        ),
+        met: (!compared.is_empty()).then_some(worse.is_empty() && level == 0),
+    });
+    targets.push(Target {
+        what: "processor time of the fastest baseline that is right and fits as well, over twin's (median)".to_owned(),
+        wanted: "≥ 10".to_owned(),
+        found: summary
+            .speed
+            .map_or("not measured".to_owned(), |(ratio, cases)| format!("{ratio:.2} ({cases} cases)")),
+        met: summary.speed.map(|(ratio, _)| ratio >= 10.0),
+    });
+    targets
+}
