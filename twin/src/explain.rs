@@ -501,14 +501,17 @@ fn judge(
     let known = noise.max(bench.problem.accuracy.zero);
     if selection.named.is_empty() {
         let residual = &selection.plain.residual;
-        let common =
-            (quantile(residual, COMMON.0) / COMMON.1).min(rms(residual.iter().copied()));
+        let common = (quantile(residual, COMMON.0) / COMMON.1).min(rms(residual.iter().copied()));
         // What the readings jump by from one to the next is the most that noise without a memory can be.
         let (floor, times, of) = if noise > 0.0 {
             (known, LOUD, "the noise that the model file states")
         } else {
             let jumps = fit::spread(&jumps(residual)) / std::f64::consts::SQRT_2;
-            (known.max(jumps), SLOW, "what it changes from reading to reading")
+            (
+                known.max(jumps),
+                SLOW,
+                "what it changes from reading to reading",
+            )
         };
         return if floor > 0.0 && common > times * floor {
             selection.decisions.push(format!(

@@ -86,6 +86,8 @@ pub struct Sensor {
     pub held_reference: bool,
     /// Of a board: time from the end of a conversion to the earliest row that can tell of it, in s.
     pub age_s: f64,
+    /// Of a board: width of the time within which that moment is uncertain, in s.
+    pub jitter_s: f64,
     /// Time by which readings stand for an earlier moment than their row, in s; `twin explain` finds it with an effect.
     pub alignment_s: f64,
 }
@@ -323,6 +325,7 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
             ("noise_coloured", sensor.noise_coloured),
             ("noise_coloured_tau_s", sensor.noise_coloured_tau_s),
             ("age_s", sensor.age_s),
+            ("jitter_s", sensor.jitter_s),
             ("full_scale", sensor.full_scale.unwrap_or(1.0)),
             ("range_limit", sensor.range_limit.unwrap_or(1.0)),
         ],
@@ -351,12 +354,14 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
                 "window_s: front_end = \"pair\" has no sliding average of readings",
             ));
         }
-        if sensor.age_s > 0.0 {
-            return Err(places.fault(
-                &["sensor", "age_s"],
-                "a time",
-                "none: front_end = \"pair\" has no conversions",
-            ));
+        for (key, value) in [("age_s", sensor.age_s), ("jitter_s", sensor.jitter_s)] {
+            if value > 0.0 {
+                return Err(places.fault(
+                    &["sensor", key],
+                    "a time",
+                    "none: front_end = \"pair\" has no conversions",
+                ));
+            }
         }
         return Ok(());
     }

@@ -65,6 +65,32 @@ pub struct Item {
     pub fresh: Vec<bool>,
 }
 
+/// Mean square of the width of a board's reading: the step of the range that it is in, and what the current moves by while the
+/// moment is uncertain.
+fn board_squares(sensor: &Sensor, base: &SensorBase, observed: &Observed, high: &[f64]) -> f64 {
+    let (mut rows, mut large) = (0.0, 0.0);
+    let (mut pairs, mut slopes) = (0.0, 0.0);
+    let mut last: Option<usize> = None;
+    for row in (0..observed.t_s.len()).filter(|row| observed.valid[*row]) {
+        rows += 1.0;
+        large += f64::from(u8::from(high[row] > 0.5));
+        if let Some(before) = last
+            && observed.segment[before] == observed.segment[row]
+        {
+            let step_s = observed.t_s[row] - observed.t_s[before];
+            let slope = (base.reading[row] - base.reading[before]) / step_s;
+            if slope.is_finite() {
+                pairs += 1.0;
+                slopes += slope * slope;
+            }
+        }
+        last = Some(row);
+    }
+    let share = large / f64::max(rows, 1.0);
+    let steps = base.step.powi(2) * (1.0 - share + share * base.range_ratio.max(1.0).powi(2));
+    steps + sensor.jitter_s.powi(2) * slopes / f64::max(pairs, 1.0)
+}
+
 /// Ages that are tried to either side where the rows do not tell the age of a reading.
 const PHASES: i32 = 10;
 
@@ -276,6 +302,7 @@ impl Work<'_> {
         let mut fresh = Vec::new();
         let mut drive = drive.clone();
         let mut observed = observed.clone();
+        let mut squares = sensor.step.powi(2);
         let mut base = SensorBase {
             window_s: sensor.window_s,
             step: sensor.step,
@@ -304,6 +331,7 @@ impl Work<'_> {
             self.compare_range_flag(board, &mut drive, &observed, &reported.range_high);
             base.reading = reported.current_a;
             fresh = reported.fresh;
+            squares = board_squares(sensor, &base, &observed, &reported.range_high);
             let mut spoiled = 0;
             for (row, reading) in base.reading.iter().enumerate() {
                 if reading.is_nan() && observed.valid[row] {
@@ -317,7 +345,6 @@ impl Work<'_> {
                 ));
             }
         }
-        let step = base.step;
         let problem = Problem {
             view: View::Sensor,
             name: measured.to_owned(),
@@ -326,8 +353,8 @@ impl Work<'_> {
             observed,
             base: Base::Sensor(base),
             modelled: Vec::new(),
-            noise: (sensor.noise.powi(2) + sensor.noise_coloured.powi(2) + step * step / 12.0)
-                .sqrt(),
+            // Steps and uncertain moments are spread evenly: the variance of a width is its square by twelve.
+            noise: (sensor.noise.powi(2) + sensor.noise_coloured.powi(2) + squares / 12.0).sqrt(),
             coloured: Coloured {
                 rms: sensor.noise_coloured,
                 tau_s: sensor.noise_coloured_tau_s,

@@ -153,13 +153,15 @@ fn counter(model: &Model, prepared: &Prepared) -> Option<Vec<f64>> {
     }
     let charge = model.charge.as_ref()?;
     let step = charge.step_c;
-    let counted = integral_c(problem, &predicted(item)).into_iter().map(|sum| {
-        if step > 0.0 {
-            (sum / step).floor() * step
-        } else {
-            sum
-        }
-    });
+    let counted = integral_c(problem, &predicted(item))
+        .into_iter()
+        .map(|sum| {
+            if step > 0.0 {
+                (sum / step).floor() * step
+            } else {
+                sum
+            }
+        });
     Some(counted.collect())
 }
 
