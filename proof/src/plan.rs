@@ -53,8 +53,8 @@ const NOISES: [&str; 3] = ["white", "coloured", "quantised"];
 const DRIVES: [&str; 3] = ["us06", "hwfet", "gpu"];
 /// Drives of the battery's makers.
 const CELL_DRIVES: [&str; 2] = ["us06", "hwfet"];
-/// Rows of a case of the sensing chain: ten minutes at 10 Hz.
-const ROWS: usize = 6000;
+/// Rows of a case of the sensing chain: a little less than seven minutes at 10 Hz.
+const ROWS: usize = 4000;
 /// Rows of a circuit: five minutes.
 const CIRCUIT_ROWS: usize = 3000;
 /// Rows of a Doyle–Fuller–Newman cell, which takes a third of a minute for 6,000.
