@@ -134,8 +134,11 @@ fn problem(rows: usize, view: View, effects: &[(&str, &[f64])]) -> Problem {
     problem
 }
 
+/// Ids and values.
+type Effects = &'static [(&'static str, &'static [f64])];
+
 /// Models of one evaluation: what a sensor and a battery usually come down to.
-const MODELS: [(&str, View, &[(&str, &[f64])]); 6] = [
+const MODELS: [(&str, View, Effects); 6] = [
     ("sensor, gain", View::Sensor, &[("gain", &[1.01])]),
     (
         "sensor, lag and gain with temperature",
