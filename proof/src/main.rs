@@ -99,6 +99,9 @@ struct Run {
     /// Only cases whose id has this in it
     #[arg(long)]
     only: Option<String>,
+    /// Begin no case after so many minutes; the next run goes on there
+    #[arg(long)]
+    minutes: Option<u64>,
     /// Keep the data of every case, not only of those that went wrong
     #[arg(long)]
     keep: bool,
@@ -179,6 +182,9 @@ fn run(arguments: &Run) -> Result<bool> {
         real,
         workers,
         keep: arguments.keep,
+        limit: arguments
+            .minutes
+            .map(|minutes| Duration::from_secs(60 * minutes)),
         root,
     };
     let records = campaign.run(&plan)?;
@@ -189,6 +195,7 @@ fn run(arguments: &Run) -> Result<bool> {
     let processors = thread::available_parallelism().map_or(1, usize::from);
     let summary = summary::summary(
         &records,
+        plan.len(),
         extent,
         seal::hash_file(&campaign.tool.program)?,
         processors,

@@ -164,6 +164,13 @@ fn index(summary: &Summary, folder: &Path) -> String {
     if quick {
         text.push_str("**The quick part of the campaign only.**\n\n");
     }
+    if summary.cases < summary.planned {
+        let _ = writeln!(
+            text,
+            "**{} of the plan's {} cases: the run was ended before the rest, and nothing was chosen but the time.**\n",
+            summary.cases, summary.planned
+        );
+    }
     let kinds: Vec<String> = summary
         .by_kind
         .iter()

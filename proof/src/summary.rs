@@ -212,8 +212,10 @@ pub struct Summary {
     pub tool_sha256: String,
     /// Processors of the machine.
     pub processors: usize,
-    /// Cases of the plan.
+    /// Cases that were run.
     pub cases: usize,
+    /// Cases of the plan.
+    pub planned: usize,
     /// Seconds of the wall clock that each part took in all, on one processor.
     pub parts_s: BTreeMap<String, f64>,
     /// Without data, by the maker's own limits: id and reason.
@@ -355,7 +357,13 @@ pub fn kind_title(kind: &str) -> &'static str {
 }
 
 /// Every table.
-pub fn summary(records: &[Record], plan: &str, tool_sha256: String, processors: usize) -> Summary {
+pub fn summary(
+    records: &[Record],
+    planned: usize,
+    plan: &str,
+    tool_sha256: String,
+    processors: usize,
+) -> Summary {
     let scored: Vec<Scored<'_>> = records
         .iter()
         .filter_map(|record| {
@@ -401,6 +409,7 @@ pub fn summary(records: &[Record], plan: &str, tool_sha256: String, processors: 
         tool_sha256,
         processors,
         cases: records.len(),
+        planned,
         parts_s: parts(records),
         not_made: records
             .iter()

@@ -46,7 +46,7 @@ const ALIKE: f64 = 0.35;
 /// physics of the same shape would leave as much.
 const DOUBTFUL: f64 = 0.12;
 /// Below this ratio it is traces, wherever they sit: even a true effect's equation is a model.
-const TRACES: f64 = 0.02;
+const TRACES: f64 = 0.05;
 /// An effect that makes the error in another file larger by this factor is not that file's physics.
 const WORSE: f64 = 1.05;
 /// A file that was never fitted confirms the effects if they bring its error down to this share.

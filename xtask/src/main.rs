@@ -71,6 +71,9 @@ enum Command {
         /// Only the small part
         #[arg(long)]
         quick: bool,
+        /// Begin no case after so many minutes; the next run goes on there
+        #[arg(long, value_name = "N")]
+        minutes: Option<u64>,
     },
     /// Run the release image on the emulated board (`--help` tells the arguments)
     #[command(disable_help_flag = true)]
@@ -130,8 +133,8 @@ fn run(command: &Command) -> Result<ExitCode> {
         } else {
             ExitCode::from(FAILED)
         }),
-        Command::Prove { quick } => {
-            prove::run(&workspace, *quick)?;
+        Command::Prove { quick, minutes } => {
+            prove::run(&workspace, *quick, *minutes)?;
             Ok(ExitCode::SUCCESS)
         }
         Command::Emulate { arguments } => match emulate::run(&workspace, "drive", arguments)? {},

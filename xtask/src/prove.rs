@@ -10,7 +10,7 @@ use crate::{
 };
 
 /// The whole campaign into docs/proof, or its small part into target/prove/quick. Both go on where a broken run was.
-pub fn run(workspace: &Workspace, small: bool) -> Result<()> {
+pub fn run(workspace: &Workspace, small: bool, minutes: Option<u64>) -> Result<()> {
     let python = python::proof_environment(workspace)?;
     apt::program(NGSPICE)?;
     let toolchain = toolchain::choose(workspace)?;
@@ -25,6 +25,9 @@ pub fn run(workspace: &Workspace, small: bool) -> Result<()> {
         small,
         [&program(&twin), &program(&emulate), &image, &python],
     );
+    if let Some(minutes) = minutes {
+        prove.arg("--minutes").arg(minutes.to_string());
+    }
     process::run(&mut prove)
 }
 
