@@ -11,6 +11,8 @@ use crate::effects::{Effect, Search, Stage, find};
 const MOST_EFFECTS: usize = 6;
 /// Candidates that are fitted after screening.
 const FITTED: usize = 8;
+/// The best of them that are asked whether they pass.
+const TRIED: usize = 4;
 /// First effects of pairs, and second ones of each.
 const FIRSTS: usize = 5;
 /// Pairs that are looked at, best first.
@@ -170,7 +172,20 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                     now = polish(bench, &leaner);
                     others = swapped(bench, &now);
                 }
-                let named = name(bench, &now, &others, &step_p99);
+                let mut named = name(bench, &now, &others, &step_p99);
+                // Of equals the plainest is named.
+                for _ in 0..now.model.members.len() {
+                    let Some(plainer) = plainer(bench, &now, &others, &named) else {
+                        break;
+                    };
+                    decisions.push(format!(
+                        "{} named of its equals: its equation is exact.",
+                        plainer.model.members.last().map_or("", Member::id)
+                    ));
+                    now = polish(bench, &plainer);
+                    others = swapped(bench, &now);
+                    named = name(bench, &now, &others, &step_p99);
+                }
                 // Small, and as well explained by many others: that is structure, and no name.
                 let Some(vague) = named
                     .iter()
@@ -323,16 +338,16 @@ fn step(
         .collect();
     ranked.sort_by(|a, b| a.1.total_cmp(&b.1));
     let (_, before) = losses(bench, now, sigma);
-    for (better, loss) in ranked.into_iter().take(4) {
-        if loss >= before {
-            break;
-        }
+    let promising = ranked
+        .into_iter()
+        .take_while(|(_, loss)| *loss < before)
+        .map(|(fit, _)| fit)
+        .filter(|fit| !only_aligns(bench, now, fit, fit.model.members.len() - 1))
+        .take(TRIED);
+    for better in promising {
         let index = better.model.members.len() - 1;
         let id = better.model.members[index].id();
         let gain = share(bench, now, &better);
-        if only_aligns(bench, now, &better, index) {
-            continue;
-        }
         if gain <= 0.0 {
             continue;
         }
@@ -749,6 +764,33 @@ fn swap(
         percent((here - loss) / here)
     ));
     Some(best.clone())
+}
+
+/// The model with an effect replaced by one of its equals whose equation is exact (a constant, a factor, a time), if the effect's
+/// own is not.
+fn plainer(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    others: &[(usize, Fit)],
+    named: &[Named],
+) -> Option<Fit> {
+    let exact = |member: &Member| member.effect.idealised() == 0.0;
+    named
+        .iter()
+        .filter(|one| !exact(&now.model.members[one.index]))
+        .find_map(|one| {
+            others
+                .iter()
+                .filter(|(index, _)| *index == one.index)
+                .map(|(_, fit)| fit)
+                .filter(|fit| {
+                    fit.model.members.last().is_some_and(|member| {
+                        exact(member) && one.equivalent.contains(&member.id())
+                    }) && !beaten(bench, fit, now)
+                })
+                .min_by(|a, b| a.cost.total_cmp(&b.cost))
+                .cloned()
+        })
 }
 
 /// What speaks for each effect, and what would have done as well.
