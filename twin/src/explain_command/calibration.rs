@@ -16,9 +16,11 @@ use crate::{
 
 /// Signals and the registers that correct them: gain and zero.
 const CORRECTIONS: [(&str, &str, &str); 2] = [
-    ("i_meas_a", "current gain", "zero drift"),
+    ("i_meas_a", "current gain", ZERO_DRIFT),
     ("q_meas_c", "meter: gain", "meter: offset"),
 ];
+/// Found once for a sensor, and so subtracted from current and charge (docs/configuration.md).
+const ZERO_DRIFT: &str = "zero drift";
 /// `converter: supply mode` in which a reading is referred to the measured supply.
 const SUPPLY_MEASURED: f64 = 1.0;
 
@@ -72,6 +74,7 @@ pub(super) fn calibrate(model: &Model, report: &Report) -> Calibration {
     };
     let (mut text, mut remarks) = (String::new(), Vec::new());
     let mut written = BTreeSet::new();
+    let mut zero_drift_ua = vec![0.0; 2];
     for fitted in &report.models {
         let signal = fitted.signal.as_str();
         let mut lines = [Line::IDEAL; 2];
@@ -128,7 +131,15 @@ pub(super) fn calibrate(model: &Model, report: &Report) -> Calibration {
         if let Some((_, gain, zero)) = line.filter(|_| lines != [Line::IDEAL; 2]) {
             let each = |of: fn(&Line) -> f64| lines.iter().map(of).collect();
             wanted.push((*gain, each(|line| (1.0 / line.slope - 1.0) * 1e6)));
-            wanted.push((*zero, each(|line| line.zero_a / line.slope * 1e6)));
+            let mut zeros: Vec<f64> = each(|line| line.zero_a / line.slope * 1e6);
+            if signal == "q_meas_c" {
+                // The zero drift is taken from the charge as well: what is left of the zero is the meter's own.
+                zeros
+                    .iter_mut()
+                    .zip(&zero_drift_ua)
+                    .for_each(|(zero, drift)| *zero -= drift);
+            }
+            wanted.push((*zero, zeros));
         }
         let mut heading = format!("\n# Corrects {signal}.");
         for (name, values) in wanted {
@@ -137,7 +148,12 @@ pub(super) fn calibrate(model: &Model, report: &Report) -> Calibration {
                 continue;
             }
             match register(&mut configuration, name, &values) {
-                Ok(lines) => text.push_str(&(std::mem::take(&mut heading) + "\n" + &lines)),
+                Ok(lines) => {
+                    text.push_str(&(std::mem::take(&mut heading) + "\n" + &lines));
+                    if name == ZERO_DRIFT {
+                        zero_drift_ua = values;
+                    }
+                }
                 Err(why) => {
                     remarks.push(format!("The board cannot correct all of {signal}: {why}."))
                 }
@@ -379,9 +395,10 @@ mod tests {
             values["meter: offset"]["small"].as_integer(),
             Some(-200_000)
         );
+        // The zero drift of 0.5 A acts on the charge as well.
         assert_eq!(
             values["meter: offset"]["large"].as_integer(),
-            Some(-200_000)
+            Some(-700_000)
         );
         assert!(remarks.is_empty(), "{remarks:?}");
     }
