@@ -193,13 +193,18 @@ fn run(arguments: &Run) -> Result<bool> {
         Extent::Full => "full",
     };
     let processors = thread::available_parallelism().map_or(1, usize::from);
-    let summary = summary::summary(
+    let mut summary = summary::summary(
         &records,
         plan.len(),
         extent,
         seal::hash_file(&campaign.tool.program)?,
         processors,
     );
+    // Pages are for others: no path of this machine.
+    let here = format!("{}/", campaign.root.display());
+    for (_, why) in summary.not_made.iter_mut().chain(&mut summary.errors) {
+        *why = why.replace(&here, "");
+    }
     let pages = match &arguments.docs {
         Some(docs) => absolute(docs)?,
         None => campaign.out.join("pages"),
