@@ -12,7 +12,7 @@ pub mod screen;
 pub mod select;
 pub mod workbench;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use crate::effects::chain::{Chain, Nuisance};
@@ -20,8 +20,8 @@ use crate::effects::scene::Scale;
 use crate::effects::{Effect, Search, Stage, find, find_with};
 use crate::problem::Problem;
 use crate::report::data::{
-    EffectReport, FittedModel, HoldoutReport, Inputs, Location, ParameterReport, Report,
-    SignalPlots, SignalReport, Unexplained, Verdict,
+    EffectReport, FittedModel, HoldoutReport, Location, ParameterReport, Report, SignalPlots,
+    SignalReport, Unexplained, Verdict,
 };
 use crate::spectrum;
 use fit::Fit;
@@ -91,21 +91,9 @@ pub fn explain(
     let started = Instant::now();
     let mut report = Report {
         schema: 1,
-        verdict: Verdict::NoMismatch,
-        summary: String::new(),
-        signals: Vec::new(),
-        locations: Vec::new(),
-        effects: Vec::new(),
-        holdouts: Vec::new(),
-        unexplained: Vec::new(),
-        decisions: Vec::new(),
-        remarks: Vec::new(),
-        seconds: 0.0,
         seed: options.seed,
         version: env!("CARGO_PKG_VERSION").to_owned(),
-        inputs: Inputs::default(),
-        plots: Vec::new(),
-        models: Vec::new(),
+        ..Report::default()
     };
     let mut parts = Vec::new();
     for (index, problem) in problems.iter().enumerate() {
@@ -185,10 +173,19 @@ fn one(
     progress(0.95, "looking at what is left");
     let features = Features::new(&bench);
     let before = features.explain(&selection.plain.residual, options.seed);
-    veto(&bench, &mut selection, problem, holdouts);
+    let others: Vec<Unfitted<'_>> = holdouts
+        .iter()
+        .flat_map(|holdout| holdout.problems.iter().map(move |other| (holdout, other)))
+        .filter(|(_, other)| other.name == problem.name)
+        .map(|(holdout, other)| Unfitted {
+            file: &holdout.file,
+            bench: Workbench::new(other, &[]),
+        })
+        .collect();
+    veto(&bench, &mut selection, &others);
     vague(&bench, &mut selection, options.seed);
     let left = features.explain(&selection.fit.residual, options.seed);
-    let confirmed = confirmed(&selection, problem, holdouts);
+    let confirmed = confirmed(&selection, &others);
     let verdict = judge(
         &bench,
         &mut selection,
@@ -227,15 +224,14 @@ fn one(
     report
         .effects
         .extend(effects(&bench, &selection, options.seed));
-    for holdout in holdouts {
-        for other in holdout
-            .problems
-            .iter()
-            .filter(|other| other.name == problem.name)
-        {
-            report.holdouts.push(held_out_file(holdout, other, model));
-        }
-    }
+    report
+        .holdouts
+        .extend(others.iter().map(|other| HoldoutReport {
+            file: other.file.display().to_string(),
+            signal: problem.name.clone(),
+            rmse_before: other.rmse_before(),
+            rmse_after: other.rmse(model),
+        }));
     if matches!(verdict, Verdict::Unknown | Verdict::PartlyExplained) {
         let place = locate::locate(&bench, &selection.fit.residual, options.seed)
             .into_iter()
@@ -263,45 +259,41 @@ fn jumps(residual: &[f64]) -> Vec<f64> {
     residual.windows(2).map(|pair| pair[1] - pair[0]).collect()
 }
 
-/// Whether every file that was never fitted is predicted much better with the effects than without.
-fn confirmed(selection: &Selection, problem: &Problem, holdouts: &[Holdout]) -> bool {
-    let mut any = false;
-    let others = holdouts
-        .iter()
-        .flat_map(|holdout| &holdout.problems)
-        .filter(|other| other.name == problem.name);
-    for other in others {
-        any = true;
-        let bench = Workbench::new(other, &[]);
-        let after = rms(bench
-            .residual(&bench.run(&elsewhere(&selection.fit.model)))
-            .into_iter());
-        if after > CONFIRMED * rms(bench.residual(&bench.plain).into_iter()) {
-            return false;
-        }
+/// A file that was never fitted, ready to be predicted.
+struct Unfitted<'a> {
+    file: &'a Path,
+    bench: Workbench<'a>,
+}
+
+impl Unfitted<'_> {
+    /// Error with a model; how the file starts is its own.
+    fn rmse(&self, model: &Model) -> f64 {
+        let predicted = self.bench.run(&elsewhere(model));
+        rms(self.bench.residual(&predicted).into_iter())
     }
-    any
+
+    /// Error as designed.
+    fn rmse_before(&self) -> f64 {
+        rms(self.bench.residual(&self.bench.plain).into_iter())
+    }
+}
+
+/// Whether every file that was never fitted is predicted much better with the effects than without.
+fn confirmed(selection: &Selection, others: &[Unfitted<'_>]) -> bool {
+    let better =
+        |other: &Unfitted<'_>| other.rmse(&selection.fit.model) <= CONFIRMED * other.rmse_before();
+    !others.is_empty() && others.iter().all(better)
 }
 
 /// Takes effects out again that make the prediction of files that were never fitted worse.
-fn veto(bench: &Workbench<'_>, selection: &mut Selection, problem: &Problem, holdouts: &[Holdout]) {
-    let others: Vec<&Problem> = holdouts
-        .iter()
-        .flat_map(|holdout| &holdout.problems)
-        .filter(|other| other.name == problem.name)
-        .collect();
+fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>]) {
     if others.is_empty() {
         return;
     }
     let worst = |with: &Model, without: &Model| -> f64 {
         others
             .iter()
-            .map(|other| {
-                let bench = Workbench::new(other, &[]);
-                let rmse =
-                    |model: &Model| rms(bench.residual(&bench.run(&elsewhere(model))).into_iter());
-                rmse(with) / rmse(without).max(1e-300)
-            })
+            .map(|other| other.rmse(with) / other.rmse(without).max(1e-300))
             .fold(0.0, f64::max)
     };
     while !selection.named.is_empty() {
@@ -566,19 +558,7 @@ fn judge(
     }
     if smooth > 0.0 || beyond > 0.0 {
         let ratio = smooth.max(beyond) / explained.max(1e-300);
-        let change: Vec<f64> = selection
-            .fit
-            .predicted
-            .iter()
-            .zip(&selection.plain.predicted)
-            .map(|(after, before)| {
-                if (after - before).is_finite() {
-                    after - before
-                } else {
-                    0.0
-                }
-            })
-            .collect();
+        let change = fit::change(&selection.fit.predicted, &selection.plain.predicted);
         let (shape, change) = features.shape(&selection.fit.residual, &change);
         let alike = if smooth > 0.0 {
             correlation(&shape, &change)
@@ -736,17 +716,6 @@ fn effects(bench: &Workbench<'_>, selection: &Selection, seed: u64) -> Vec<Effec
             }
         })
         .collect()
-}
-
-fn held_out_file(holdout: &Holdout, other: &Problem, model: &Model) -> HoldoutReport {
-    let bench = Workbench::new(other, &[]);
-    let model = elsewhere(model);
-    HoldoutReport {
-        file: holdout.file.display().to_string(),
-        signal: other.name.clone(),
-        rmse_before: rms(bench.residual(&bench.plain).into_iter()),
-        rmse_after: rms(bench.residual(&bench.run(&model)).into_iter()),
-    }
 }
 
 fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> SignalPlots {

@@ -200,17 +200,7 @@ impl Slope {
         if length.is_nan() || length <= 0.0 {
             return;
         }
-        let mut missing: Vec<f64> = after
-            .iter()
-            .zip(before)
-            .map(|(after, before)| {
-                if (after - before).is_finite() {
-                    after - before
-                } else {
-                    0.0
-                }
-            })
-            .collect();
+        let mut missing = change(after, before);
         for (column, s) in self.columns.iter().zip(step) {
             missing
                 .iter_mut()
@@ -492,6 +482,18 @@ fn cost(
         .map(|(_, _, prior, at)| 0.5 * prior * at * at)
         .sum();
     loss + penalty
+}
+
+/// What a simulation says more than another; 0 beyond the drive's ends, where nothing is known.
+pub fn change(after: &[f64], before: &[f64]) -> Vec<f64> {
+    after
+        .iter()
+        .zip(before)
+        .map(|(after, before)| {
+            let change = after - before;
+            if change.is_finite() { change } else { 0.0 }
+        })
+        .collect()
 }
 
 /// Fits every free value from where the model stands. `used` weighs rows (0: left out); sigma is found on the way.

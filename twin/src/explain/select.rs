@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::fit::{Fit, fit, held_out, huber, polish};
+use super::fit::{Fit, change, fit, held_out, huber, polish};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search, Stage, find};
@@ -396,18 +396,7 @@ fn obstacle(
     let member = &after.model.members[index];
     let card = member.effect.card();
     let without = bench.run(&after.model.without(index));
-    let change: Vec<f64> = after
-        .predicted
-        .iter()
-        .zip(&without)
-        .map(|(with, without)| {
-            if (with - without).is_finite() {
-                with - without
-            } else {
-                0.0
-            }
-        })
-        .collect();
+    let change = change(&after.predicted, &without);
     let largest = change.iter().fold(0.0f64, |most, c| most.max(c.abs()));
     let (mut from, mut to, mut changed, mut accuracy, mut rows) = (0.0, 0.0, 0.0, 0.0, 0.0);
     for (row, change) in change.iter().enumerate() {

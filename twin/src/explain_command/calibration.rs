@@ -308,7 +308,7 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use crate::report::data::{EffectReport, FittedModel, Inputs, Verdict};
+    use crate::report::data::{EffectReport, FittedModel};
 
     const BOARD: &str = "schema = 1\n[sensor]\nfront_end = \"dual-range\"\n[charge]\n";
 
@@ -318,24 +318,7 @@ mod tests {
     /// The file's values by name, and the remarks, after these effects were found.
     fn found(effects: &[Found<'_>]) -> (toml::Table, Vec<String>) {
         let model = Model::parse("m.toml", BOARD.to_owned(), Path::new("")).unwrap();
-        let mut report = Report {
-            schema: 1,
-            verdict: Verdict::Explained,
-            summary: String::new(),
-            signals: Vec::new(),
-            locations: Vec::new(),
-            effects: Vec::new(),
-            holdouts: Vec::new(),
-            unexplained: Vec::new(),
-            decisions: Vec::new(),
-            remarks: Vec::new(),
-            seconds: 0.0,
-            seed: 0,
-            version: String::new(),
-            inputs: Inputs::default(),
-            models: Vec::new(),
-            plots: Vec::new(),
-        };
+        let mut report = Report::default();
         for (signal, id, values) in effects {
             report.effects.push(EffectReport {
                 id: (*id).to_owned(),

@@ -3,10 +3,11 @@
 use serde::Serialize;
 
 /// What the tool says about the mismatch.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Verdict {
     /// Recording and simulation agree within noise and accuracy.
+    #[default]
     NoMismatch,
     /// The named effects account for the mismatch.
     Explained,
@@ -19,7 +20,7 @@ pub enum Verdict {
 }
 
 /// The whole report.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub struct Report {
     /// Version of this format: 1.
     pub schema: u32,
