@@ -29,7 +29,7 @@ const WRITE_MANY: u8 = 0x10;
 const REFUSED: u8 = 0x80;
 /// The server is busy: repeat it later.
 const BUSY: u8 = 0x06;
-/// A request that stays without an answer is sent so often: one can be lost (docs/modbus.md).
+/// A request that stays without an answer is sent so often, as masters do on a line with noise.
 const ATTEMPTS: u32 = 3;
 /// Boot takes 0.2 s, and the board answers after half a second.
 const BOOT_S: f64 = 0.8;

@@ -67,7 +67,7 @@ pub struct Item {
 
 /// Mean square of the width of a board's reading: the step of the range that it is in, and what the current moves by while the
 /// moment is uncertain.
-fn board_squares(sensor: &Sensor, base: &SensorBase, observed: &Observed, high: &[f64]) -> f64 {
+fn squared_width(sensor: &Sensor, base: &SensorBase, observed: &Observed, high: &[f64]) -> f64 {
     let (mut rows, mut large) = (0.0, 0.0);
     let (mut pairs, mut slopes) = (0.0, 0.0);
     let mut last: Option<usize> = None;
@@ -331,7 +331,7 @@ impl Work<'_> {
             self.compare_range_flag(board, &mut drive, &observed, &reported.range_high);
             base.reading = reported.current_a;
             fresh = reported.fresh;
-            squares = board_squares(sensor, &base, &observed, &reported.range_high);
+            squares = squared_width(sensor, &base, &observed, &reported.range_high);
             let mut spoiled = 0;
             for (row, reading) in base.reading.iter().enumerate() {
                 if reading.is_nan() && observed.valid[row] {

@@ -158,25 +158,7 @@ impl Features {
                 .fold(0.0, |most, share| f64::max(most, *share)),
         }
     }
-}
 
-/// Whether a series, less its mean, is like itself when it is turned.
-fn repeats(series: &[f64], (by, reversed): Turn) -> bool {
-    let count = series.len();
-    let mean = series.iter().sum::<f64>() / count.max(1) as f64;
-    let at = |row: usize| {
-        let row = (row + by) % count;
-        series[if reversed { count - 1 - row } else { row }] - mean
-    };
-    let (mut together, mut alone) = (0.0, 0.0);
-    for (row, value) in series.iter().enumerate() {
-        together += (value - mean) * at(row);
-        alone += (value - mean).powi(2);
-    }
-    together.abs() > ITSELF * alone
-}
-
-impl Features {
     /// What they make of a residual, and another series, both at the features' own rows.
     pub fn shape(&self, residual: &[f64], other: &[f64]) -> (Vec<f64>, Vec<f64>) {
         let limit = TUNING * spread(residual);
@@ -196,6 +178,22 @@ impl Features {
         }
         (shape, self.rows.iter().map(|&row| other[row]).collect())
     }
+}
+
+/// Whether a series, less its mean, is like itself when it is turned.
+fn repeats(series: &[f64], (by, reversed): Turn) -> bool {
+    let count = series.len();
+    let mean = series.iter().sum::<f64>() / count.max(1) as f64;
+    let at = |row: usize| {
+        let row = (row + by) % count;
+        series[if reversed { count - 1 - row } else { row }] - mean
+    };
+    let (mut together, mut alone) = (0.0, 0.0);
+    for (row, value) in series.iter().enumerate() {
+        together += (value - mean) * at(row);
+        alone += (value - mean).powi(2);
+    }
+    together.abs() > ITSELF * alone
 }
 
 /// A series on the drive's rows, at the rows of the observation.
