@@ -204,6 +204,12 @@ pub trait Effect: Sync {
     /// Changes the scene.
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>);
 
+    /// Values to be tried around `values`, for parameters that are searched without derivatives and depend on one another; `share`
+    /// says how far away. `None`: each by itself.
+    fn near(&self, _values: &[f64], _scale: &Scale, _share: f64) -> Option<Vec<Vec<f64>>> {
+        None
+    }
+
     /// What the readings show by themselves, whatever the simulation says.
     fn mark(&self, _scale: &Scale, _clues: &Clues<'_>) -> Option<Mark> {
         None

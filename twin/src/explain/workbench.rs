@@ -291,7 +291,9 @@ impl<'a> Workbench<'a> {
     pub fn aligns(&self, model: &Model) -> bool {
         matches!(self.problem.base, Base::Sensor(_))
             && !model.unaligned
+            // These have a time of their own.
             && !model.has("delay")
+            && !model.has("sampled-window")
             && model.members.iter().any(|member| {
                 matches!(member.effect.card().stage, Stage::Filter | Stage::Converter)
             })
@@ -373,6 +375,12 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         mismatch: rms(y.iter().zip(plain).map(|(y, p)| y - p)),
         step_s: drive.median_step_s(),
         reading_step_s,
+        even_s: match t_s {
+            [first, .., last] if reading_step_s > 0.0 => {
+                (last - first) / ((last - first) / reading_step_s).round().max(1.0)
+            }
+            _ => reading_step_s,
+        },
         fastest_s: 0.02 * drive.median_step_s().min(reading_step_s),
         span_s,
         ..Scale::default()
