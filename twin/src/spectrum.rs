@@ -152,7 +152,7 @@ pub fn strongest(t_s: &[f64], values: &[f64], step_s: f64, count: usize) -> Vec<
     peaks.sort_unstable_by(|a, b| power[*b].total_cmp(&power[*a]));
     let mut apart: Vec<usize> = Vec::new();
     for at in peaks {
-        if apart.iter().all(|other| other.abs_diff(at) > 4) {
+        if apart.iter().all(|other| other.abs_diff(at) > 8) {
             apart.push(at);
         }
         if apart.len() == count {

@@ -7,8 +7,10 @@ use super::{Card, Clues, Effect, Parameter, Search, Stage};
 
 /// Rows that the course of the delay is fitted to.
 const ENOUGH: usize = 4000;
-/// Lines in the course of the delay that are followed.
-const LINES: usize = 4;
+/// Lines in the course of the delay that are followed: a load with a rhythm of its own has many beside the right one.
+const LINES: usize = 16;
+/// The best of them.
+const BEST: usize = 4;
 /// Cycles that the age of a reading goes through in a recording at least: with fewer it is a delay.
 const CYCLES: f64 = 6.0;
 
@@ -190,7 +192,7 @@ fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
         .collect();
     let stride = t_s.len().div_ceil(ENOUGH).max(1);
     let rows = || (0..t_s.len()).step_by(stride);
-    let mut starts = Vec::new();
+    let mut found: Vec<(f64, [f64; 4])> = Vec::new();
     for line in spectrum::strongest(&t_s, &course, step, LINES) {
         if line * span < CYCLES {
             continue;
@@ -230,9 +232,11 @@ fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
                 }
             }
         }
-        let Some((_, [beat, phase, period, least])) = best else {
-            continue;
-        };
+        found.extend(best);
+    }
+    found.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let mut starts = Vec::new();
+    for (_, [beat, phase, period, least]) in found.into_iter().take(BEST) {
         let late_s = least + 0.5 * period;
         let age = phase.rem_euclid(1.0);
         // The beat is the period's rate less a whole number of times that of the rows.
