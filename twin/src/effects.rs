@@ -220,6 +220,12 @@ pub trait Effect: Sync {
         IDEALISED
     }
 
+    /// Whether the loss has a kink in a parameter (an end, a threshold, the start of a window): its interval is then found by
+    /// profile likelihood, not from slopes.
+    fn kinked(&self, _parameter: usize) -> bool {
+        false
+    }
+
     /// What follows from the values, in plain words.
     fn consequences(&self, _values: &[f64], _problem: &Problem) -> Vec<String> {
         Vec::new()

@@ -183,7 +183,7 @@ fn one(
         })
         .collect();
     veto(&bench, &mut selection, &others);
-    vague(&bench, &mut selection, options.seed);
+    vague(&bench, &mut selection);
     let left = features.explain(&selection.fit.residual, options.seed);
     let confirmed = confirmed(&selection, &others);
     let verdict = judge(
@@ -223,7 +223,7 @@ fn one(
     report.locations.extend(locations);
     report
         .effects
-        .extend(effects(&bench, &selection, options.seed));
+        .extend(effects(&bench, &selection));
     report
         .holdouts
         .extend(others.iter().map(|other| HoldoutReport {
@@ -319,9 +319,9 @@ fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>
 
 /// Takes effects out again whose values the recording does not tell; where others would do as well, the best of those whose
 /// values it does tell takes the place.
-fn vague(bench: &Workbench<'_>, selection: &mut Selection, seed: u64) {
+fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
     while !selection.named.is_empty() {
-        let intervals = intervals::intervals(bench, &selection.fit, seed);
+        let intervals = intervals::intervals(bench, &selection.fit);
         let members = &selection.fit.model.members;
         let found =
             members
@@ -339,7 +339,7 @@ fn vague(bench: &Workbench<'_>, selection: &mut Selection, seed: u64) {
             "{id}: fits, but this recording does not tell its values: {why}"
         ));
         let without = fit::fit(bench, &selection.fit.model.without(index), None);
-        match stand_in(bench, selection, &without.model, index, seed) {
+        match stand_in(bench, selection, &without.model, index) {
             Some(better) => {
                 selection.decisions.push(format!(
                     "{} instead of {id}: as good, and the recording tells its values.",
@@ -359,7 +359,6 @@ fn stand_in(
     selection: &Selection,
     without: &Model,
     index: usize,
-    seed: u64,
 ) -> Option<Fit> {
     let named = selection.named.iter().find(|one| one.index == index)?;
     let clues = bench.clues(&selection.fit.predicted);
@@ -377,7 +376,7 @@ fn stand_in(
         .map(|member| fit::fit(bench, &without.with(member), None))
         .filter(|fit| {
             let last = fit.model.members.len() - 1;
-            let intervals = intervals::intervals(bench, fit, seed);
+            let intervals = intervals::intervals(bench, fit);
             untold(&bench.scale, &fit.model.members[last], &intervals[last]).is_none()
         })
         .min_by(|a, b| a.cost.total_cmp(&b.cost))
@@ -674,8 +673,8 @@ fn unit(problem: &Problem, unit: &str) -> String {
     }
 }
 
-fn effects(bench: &Workbench<'_>, selection: &Selection, seed: u64) -> Vec<EffectReport> {
-    let intervals = intervals::intervals(bench, &selection.fit, seed);
+fn effects(bench: &Workbench<'_>, selection: &Selection) -> Vec<EffectReport> {
+    let intervals = intervals::intervals(bench, &selection.fit);
     selection
         .named
         .iter()

@@ -163,28 +163,20 @@ impl Slope {
         model
     }
 
-    /// Value of a member's parameter if its coordinate were moved by `delta`; `None` if it is not free.
-    pub fn value_at(
-        &self,
-        member: usize,
-        parameter: usize,
-        model: &Model,
-        deltas: &[f64],
-    ) -> Option<f64> {
-        self.coordinates
-            .iter()
-            .zip(deltas)
-            .find_map(|(coordinate, delta)| match coordinate {
-                Coordinate::Value(m, p, logarithmic) if (*m, *p) == (member, parameter) => {
-                    let value = model.members[member].values[parameter];
-                    Some(if *logarithmic {
-                        value * delta.exp()
-                    } else {
-                        value + delta
-                    })
-                }
-                _ => None,
-            })
+    /// Where a member's parameter is among the coordinates; `None` if it is not free. The coordinate of a
+    /// [`Search::Logarithmic`] one is its logarithm.
+    pub fn index(&self, member: usize, parameter: usize) -> Option<usize> {
+        self.coordinates.iter().position(
+            |coordinate| matches!(coordinate, Coordinate::Value(m, p, _) if (*m, *p) == (member, parameter)),
+        )
+    }
+
+    /// What the model file says of the base, as normal equations.
+    pub fn prior(&self) -> (DMatrix<f64>, DVector<f64>) {
+        let mut normal = DMatrix::zeros(self.len(), self.len());
+        let mut right = DVector::zeros(self.len());
+        self.penalty(&mut normal, &mut right);
+        (normal, right)
     }
 
     /// Carries the slope along a step (Broyden's update): cheaper than a new one, and nearly as good for small steps.
@@ -269,6 +261,7 @@ fn coordinates(bench: &Workbench<'_>, model: &Model) -> Vec<(Coordinate, f64, f6
             let (low, high) = member.effect.bounds(p, &bench.scale);
             let (logarithmic, step) = match parameter.search {
                 Search::Stepped => continue,
+                _ if model.held == Some((m, p)) => continue,
                 Search::Logarithmic => (true, 1e-3),
                 Search::Linear => {
                     let off = if parameter.off.is_finite() {
@@ -694,7 +687,10 @@ fn search_steps(
             .parameters
             .iter()
             .enumerate()
-            .filter(|(_, parameter)| parameter.search == Search::Stepped)
+            .filter(|(p, parameter)| {
+                parameter.search == Search::Stepped && model.held != Some((m, *p))
+            })
+            .collect::<Vec<_>>()
         {
             for share in SHARES {
                 for _ in 0..4 {
@@ -749,14 +745,18 @@ pub struct Blocked {
     pub rights: Vec<DVector<f64>>,
 }
 
+/// Huber's weights of residuals, in units of 1/sigma².
+pub fn weights(residual: &[f64], sigma: f64) -> Vec<f64> {
+    residual
+        .iter()
+        .map(|r| weight(r / sigma) / (sigma * sigma))
+        .collect()
+}
+
 /// Looks at a fit block by block, with Huber's weights at `sigma`.
 pub fn blocked(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Blocked {
     let slope = fit.slope(bench);
-    let weights: Vec<f64> = fit
-        .residual
-        .iter()
-        .map(|r| weight(r / sigma) / (sigma * sigma))
-        .collect();
+    let weights = weights(&fit.residual, sigma);
     let (matrices, rights) = bench
         .blocks
         .iter()

@@ -53,6 +53,8 @@ pub struct Model {
     pub nuisance: Nuisance,
     /// Samples stand at their rows, though an effect works between them.
     pub unaligned: bool,
+    /// A value that fits leave as it is: its member and its place there.
+    pub held: Option<(usize, usize)>,
 }
 
 impl Model {
@@ -108,7 +110,12 @@ pub struct Workbench<'a> {
 }
 
 /// A model to the last digit.
-type Key = (Vec<(&'static str, Vec<u64>)>, [u64; 3], bool);
+type Key = (
+    Vec<(&'static str, Vec<u64>)>,
+    [u64; 3],
+    bool,
+    Option<(usize, usize)>,
+);
 
 fn key(model: &Model) -> Key {
     let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect();
@@ -126,6 +133,7 @@ fn key(model: &Model) -> Key {
         ]
         .map(f64::to_bits),
         model.unaligned,
+        model.held,
     )
 }
 
@@ -223,25 +231,34 @@ impl<'a> Workbench<'a> {
             .sum()
     }
 
-    /// How many standard deviations a fitted change is away from what the stated coloured noise does by itself: its projection
-    /// on the change has the variance `cᵀΣc`, with Σ of an exponential memory and white noise. Infinite if none is stated.
-    pub fn deviations(&self, change: &[f64]) -> f64 {
+    /// Variance of a weighted sum of readings, `aᵀΣa`, under the noise that the model file states, with Σ of an exponential
+    /// memory and white noise; `None` if it states none with a memory.
+    pub fn carried(&self, weights: &[f64]) -> Option<f64> {
         let coloured = self.problem.coloured;
         if !(coloured.rms > 0.0 && coloured.tau_s > 0.0) {
-            return f64::INFINITY;
+            return None;
         }
         let (mut energy, mut together, mut memory) = (0.0, 0.0, 0.0);
         let mut last: Option<(f64, f64)> = None;
-        for (t, c) in self.t_s.iter().zip(change) {
+        for (t, a) in self.t_s.iter().zip(weights) {
             if let Some((before, previous)) = last {
                 memory = (memory + previous) * (-(t - before).max(0.0) / coloured.tau_s).exp();
             }
-            energy += c * c;
-            together += c * memory;
-            last = Some((*t, *c));
+            energy += a * a;
+            together += a * memory;
+            last = Some((*t, *a));
         }
-        let variance = self.problem.noise.powi(2) * energy + 2.0 * coloured.rms.powi(2) * together;
-        energy / variance.max(1e-300).sqrt()
+        Some(self.problem.noise.powi(2) * energy + 2.0 * coloured.rms.powi(2) * together)
+    }
+
+    /// How many standard deviations a fitted change is away from what the stated coloured noise does by itself: its projection
+    /// on the change has the variance `cᵀΣc`. Infinite if none is stated.
+    pub fn deviations(&self, change: &[f64]) -> f64 {
+        let energy: f64 = change.iter().map(|c| c * c).sum();
+        match self.carried(change) {
+            Some(variance) => energy / variance.max(1e-300).sqrt(),
+            None => f64::INFINITY,
+        }
     }
 
     /// The simulation at the rows that count.
