@@ -22,7 +22,7 @@ const ENOUGH: f64 = 1e-4;
 /// How far away values without a slope are tried.
 const SHARES: [f64; 8] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5];
 /// The same for values that are moved together.
-const TOGETHER: [f64; 7] = [0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4];
+const TOGETHER: [f64; 6] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4];
 
 /// A fit of more rows than this does not keep its slope: memory stays linear in the recording, with a small factor.
 const KEPT_ROWS: usize = 40_000;

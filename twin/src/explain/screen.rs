@@ -20,6 +20,8 @@ use crate::effects::{Effect, Search};
 pub const DRAWS: usize = 200;
 /// Rows that signatures are compared over; longer recordings are thinned out.
 const MOST_ROWS: usize = 30_000;
+/// Starts of an effect that are compared with placebos, by each of two measures.
+const MOST_STARTS: usize = 8;
 /// A residual moved to where a candidate looks like itself again is no placebo for it: signs are drawn then.
 pub const ITSELF: f64 = 0.6;
 
@@ -132,7 +134,7 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
                 .map(move |values| (effect, values))
         })
         .collect();
-    let mut entries: Vec<Entry> = candidates
+    let mut signatures: Vec<Signature> = candidates
         .into_par_iter()
         .filter_map(|(effect, values)| {
             let base = replaced(&fit.model, effect);
@@ -166,6 +168,19 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
             if columns.is_empty() {
                 return None;
             }
+            Some(Signature {
+                effect,
+                values,
+                columns,
+                loss,
+            })
+        })
+        .collect();
+    fewer(&mut signatures, &residual);
+    let mut entries: Vec<Entry> = signatures
+        .into_par_iter()
+        .map(|signature| {
+            let columns = signature.columns;
             let folds = Folds::new(
                 thin.blocks
                     .iter()
@@ -182,15 +197,17 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
                         .map(|column| dot(&column[rows.clone()], residual))
                 })
                 .collect();
-            let entry = Entry {
-                member: Member { effect, values },
+            Entry {
+                member: Member {
+                    effect: signature.effect,
+                    values: signature.values,
+                },
                 gain: folds.gain(&rights) / all,
-                loss,
+                loss: signature.loss,
                 columns,
                 folds,
                 rights,
-            };
-            Some(entry)
+            }
         })
         .collect();
     entries.sort_by(|a, b| b.gain.total_cmp(&a.gain));
@@ -199,6 +216,45 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
         entries,
         placebo_p99,
     }
+}
+
+/// A start with the columns of its change.
+struct Signature {
+    effect: &'static dyn Effect,
+    values: Vec<f64>,
+    columns: Vec<Vec<f64>>,
+    loss: f64,
+}
+
+/// Of effects whose values are all searched in steps, and which have many starts therefore: the nearest as they are, and the
+/// nearest by shape.
+fn fewer(signatures: &mut Vec<Signature>, residual: &[f64]) {
+    let mut kept = Vec::with_capacity(signatures.len());
+    let mut left: Vec<Signature> = Vec::new();
+    for signature in signatures.drain(..) {
+        if stepped(signature.effect) {
+            left.push(signature);
+        } else {
+            kept.push(signature);
+        }
+    }
+    while let Some(id) = left.first().map(|signature| signature.effect.card().id) {
+        let (mut these, others): (Vec<Signature>, Vec<Signature>) = left
+            .into_iter()
+            .partition(|signature| signature.effect.card().id == id);
+        left = others;
+        let shape = |signature: &Signature| {
+            let column = &signature.columns[0];
+            -dot(column, residual).powi(2) / dot(column, column).max(1e-300)
+        };
+        these.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+        let mut others = these.split_off(MOST_STARTS.min(these.len()));
+        others.sort_by_cached_key(|signature| std::cmp::Reverse((-shape(signature)).to_bits()));
+        others.truncate(MOST_STARTS);
+        kept.extend(these);
+        kept.extend(others);
+    }
+    *signatures = kept;
 }
 
 /// Whether an effect can be added: it is not there yet, or it has more branches than what is there.

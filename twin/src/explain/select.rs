@@ -323,11 +323,11 @@ fn fits(
     }
     let mut chosen: Vec<&Entry> = Vec::new();
     for mut of in effects {
-        // Where the size is not free, nothing but the start itself says how good it is.
-        if of[0].fixed() {
-            of.sort_by(|a, b| a.loss.total_cmp(&b.loss));
-        }
+        // Where the size is not free, the start itself says how good it is: one more by that.
+        let nearest = of.iter().min_by(|a, b| a.loss.total_cmp(&b.loss)).copied();
+        let nearest = nearest.filter(|_| of[0].fixed());
         of.truncate(starts);
+        of.extend(nearest.filter(|nearest| !of.iter().any(|entry| std::ptr::eq(*entry, *nearest))));
         chosen.extend(of);
     }
     chosen
