@@ -9,7 +9,9 @@ use super::{Card, Clues, Effect, Parameter, Search, Stage};
 const ENOUGH: usize = 4000;
 /// Lines in the course of the delay that are followed: a load with a rhythm of its own has many beside the right one.
 const LINES: usize = 16;
-/// The best of them.
+/// Rates of updates that are followed.
+const UPDATES: usize = 6;
+/// The best of the lines.
 const BEST: usize = 6;
 /// Cycles that the age of a reading goes through in a recording at least: with fewer it is a delay.
 const CYCLES: f64 = 6.0;
@@ -47,31 +49,18 @@ impl Effect for SampledWindow {
     }
 
     fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>> {
-        // A held reading moves at one phase of each period only: its squared steps have lines at the rate of the updates.
-        let moves: Vec<f64> = std::iter::once(0.0)
-            .chain(
-                clues
-                    .observed
-                    .windows(2)
-                    .map(|pair| (pair[1] - pair[0]).abs()),
-            )
-            .collect();
         let lowest = 2.5 * scale.step_s;
         let (_, highest) = self.bounds(0, scale);
         let mut starts = by_age(clues, scale);
-        for line in spectrum::lines(clues.t_s, &moves, scale.reading_step_s) {
+        for (frequency_hz, moved_s) in updates(clues, scale) {
             for multiple in [1.0, 2.0] {
-                let period = multiple / line.frequency_hz;
+                let period = multiple / frequency_hz;
                 if !(lowest..=highest).contains(&period) {
                     continue;
                 }
-                // The sine of the line is largest when the reading moves, which is when a window ends.
-                let turn = std::f64::consts::FRAC_PI_2 - line.phase_rad;
-                let moved_s =
-                    turn / (std::f64::consts::TAU * line.frequency_hz) - 0.5 * scale.reading_step_s;
-                for duty in [0.1, 0.25, 0.4, 0.55, 0.75, 1.0] {
+                for duty in [0.1, 0.3, 0.6, 1.0] {
                     starts.push(vec![period, duty, 0.0]);
-                    let phase = (moved_s - duty * period - clues.t_s[0]).rem_euclid(period);
+                    let phase = (moved_s - duty * period).rem_euclid(period);
                     starts.push(vec![period, duty, phase]);
                 }
             }
@@ -105,6 +94,14 @@ impl Effect for SampledWindow {
         .into_iter()
         .flat_map(along)
         .collect();
+        // Every second window, or one more between two.
+        let length = duty * period;
+        for (period, later) in [(2.0, 0.0), (2.0, 1.0), (0.5, 0.0)]
+            .map(|(times, later)| (times * period, later * period))
+        {
+            let duty = (length / period).min(1.0);
+            near.push(vec![period, duty, phase + length + later - duty * period]);
+        }
         // Another period by which readings are as old at their rows.
         let age = (-(phase / period + duty)).rem_euclid(1.0);
         for rate in [1.0, -1.0].map(|turns| 1.0 / period + turns / scale.even_s) {
@@ -153,6 +150,43 @@ impl Effect for SampledWindow {
         }
         scene.signal = output;
     }
+}
+
+/// Rates in Hz at which readings move, and when they first do, in s from the first reading: a held one moves at one phase of each
+/// period only, however the current moves.
+fn updates(clues: &Clues<'_>, scale: &Scale) -> Vec<(f64, f64)> {
+    let moves = |series: &[f64]| -> Vec<f64> {
+        std::iter::once(0.0)
+            .chain(series.windows(2).map(|pair| (pair[1] - pair[0]).abs()))
+            .map(|by| if by.is_finite() { by } else { 0.0 })
+            .collect()
+    };
+    let (seen, simulated) = (moves(clues.observed), moves(clues.predicted));
+    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let share = product(&seen, &simulated) / product(&simulated, &simulated).max(1e-300);
+    let beyond: Vec<f64> = seen
+        .iter()
+        .zip(&simulated)
+        .map(|(seen, simulated)| seen - share * simulated)
+        .collect();
+    spectrum::strongest(clues.t_s, &beyond, scale.reading_step_s, UPDATES)
+        .into_iter()
+        .filter(|frequency_hz| *frequency_hz > 0.0)
+        .map(|frequency_hz| {
+            let (mut sine, mut cosine) = (0.0, 0.0);
+            for (t, by) in clues.t_s.iter().zip(&beyond) {
+                let turn = std::f64::consts::TAU * frequency_hz * (t - clues.t_s[0]);
+                sine += by * turn.sin();
+                cosine += by * turn.cos();
+            }
+            // It is between two readings.
+            let turns = f64::atan2(sine, cosine) / std::f64::consts::TAU;
+            (
+                frequency_hz,
+                turns / frequency_hz - 0.5 * scale.reading_step_s,
+            )
+        })
+        .collect()
 }
 
 /// Values for windows of a period, from the mean time by which readings are late, and the age of the first reading in periods.
