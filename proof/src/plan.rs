@@ -53,6 +53,8 @@ const NOISES: [&str; 3] = ["white", "coloured", "quantised"];
 const DRIVES: [&str; 3] = ["us06", "hwfet", "gpu"];
 /// Drives of the battery's makers.
 const CELL_DRIVES: [&str; 2] = ["us06", "hwfet"];
+/// A third one: pulses between rests.
+const PULSES: &str = "hppc";
 /// Rows of a case of the sensing chain: a little less than seven minutes at 10 Hz.
 const ROWS: usize = 4000;
 /// Rows of a circuit: five minutes.
@@ -339,13 +341,13 @@ fn others() -> Vec<Planned> {
 
 /// Cells by PyBaMM.
 fn cells() -> Vec<Planned> {
-    let cell = |effects: &[&str], strength, drive, more: Value| {
+    let noisy = |effects: &[&str], strength, noise, drive, more: Value| {
         New {
             group: Group::Cells,
             maker: "cells",
             effects,
             strength,
-            noise: "white",
+            noise,
             drive,
             seed: 1,
             rows: if more.get("model") == Some(&json!("dfn")) {
@@ -356,6 +358,9 @@ fn cells() -> Vec<Planned> {
             options: options(more),
         }
         .planned()
+    };
+    let cell = |effects: &[&str], strength, drive, more: Value| {
+        noisy(effects, strength, "white", drive, more)
     };
     let mut plan = Vec::new();
     // What such a cell has by nature, beside open-circuit voltage and one resistance.
@@ -393,6 +398,22 @@ fn cells() -> Vec<Planned> {
     ] {
         for (strength, drive) in [(10.0, "hwfet"), (30.0, "hwfet"), (30.0, "us06")] {
             plan.push(cell(&[effect], strength, drive, Value::Null));
+        }
+        for noise in ["coloured", "quantised"] {
+            plan.push(noisy(&[effect], 30.0, noise, "us06", Value::Null));
+        }
+    }
+    for (noise, drive) in [
+        ("coloured", "us06"),
+        ("quantised", "us06"),
+        ("white", PULSES),
+        ("coloured", PULSES),
+    ] {
+        let spme = || json!({ "model": "spme" });
+        plan.push(noisy(&["diffusion"], 10.0, noise, drive, spme()));
+        // The circuit was fitted to driving: pulses show more than it leaves there.
+        if drive != PULSES {
+            plan.push(noisy(&[], f64::INFINITY, noise, drive, spme()));
         }
     }
     // Only what such a circuit leaves.
@@ -452,7 +473,7 @@ fn single_battery() -> Vec<Planned> {
     for effect in BATTERY {
         for strength in STRENGTHS {
             for noise in NOISES {
-                for (place, drive) in CELL_DRIVES.into_iter().enumerate() {
+                for (place, drive) in CELL_DRIVES.into_iter().chain([PULSES]).enumerate() {
                     if place == 0 || noise == "white" {
                         plan.push(single(
                             "battery",
