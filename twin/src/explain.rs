@@ -47,6 +47,12 @@ const ALIKE: f64 = 0.35;
 const DOUBTFUL: f64 = 0.12;
 /// Below this ratio it is traces, wherever they sit: even a true effect's equation is a model.
 const TRACES: f64 = 0.05;
+/// An effect whose values would have to differ from stretch to stretch, each of them by this share of its energy (14 % of it, rms), is
+/// not what is there: true ones of other people's cells, whose equations are rough, stay below.
+const WAVERS: f64 = 0.02;
+/// From this share on (5 % rms, as much as an idealised equation may be off) the name is doubted: another physics of much the same
+/// shape could be behind it. The same where so much of what the effects take is left within reach of the inputs.
+const DOUBTED: f64 = 0.0025;
 /// An effect that makes the error in another file larger by this factor is not that file's physics.
 const WORSE: f64 = 1.05;
 /// A file that was never fitted confirms the effects if they bring its error down to this share.
@@ -183,6 +189,7 @@ fn one(
         })
         .collect();
     veto(&bench, &mut selection, &others);
+    let taken_back = wavering(&bench, &mut selection, &others);
     vague(&bench, &mut selection);
     let left = features.explain(&selection.fit.residual, options.seed);
     let confirmed = confirmed(&selection, &others);
@@ -195,6 +202,7 @@ fn one(
         left,
         options.seed,
     );
+    let (verdict, doubted) = doubt(&bench, &mut selection, verdict, left, confirmed, taken_back);
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);
@@ -232,7 +240,7 @@ fn one(
             rmse_before: other.rmse_before(),
             rmse_after: other.rmse(model),
         }));
-    if matches!(verdict, Verdict::Unknown | Verdict::PartlyExplained) {
+    if doubted || matches!(verdict, Verdict::Unknown | Verdict::PartlyExplained) {
         let place = locate::locate(&bench, &selection.fit.residual, options.seed)
             .into_iter()
             .next();
@@ -247,7 +255,7 @@ fn one(
     report
         .plots
         .push(plots(&bench, &selection.fit, &held_residual));
-    let sentence = sentence(&bench, &selection, verdict, left, report);
+    let sentence = sentence(&bench, &selection, (verdict, doubted), left, report);
     Part {
         verdict,
         sentence,
@@ -315,6 +323,35 @@ fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>
         selection.fit = fit::polish(bench, &without);
         selection.rename(bench);
     }
+}
+
+/// Takes effects out again whose values would have to differ from stretch to stretch by more than noise makes them; true if there
+/// were any.
+fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>]) -> bool {
+    let mut any = false;
+    while !selection.named.is_empty() && !confirmed(selection, others) {
+        let found = intervals::variations(bench, &selection.fit)
+            .into_iter()
+            .enumerate()
+            .filter(|(_, variation)| {
+                variation.deviations > select::CERTAIN && variation.share > WAVERS
+            })
+            .max_by(|a, b| a.1.share.total_cmp(&b.1.share));
+        let Some((index, variation)) = found else {
+            break;
+        };
+        selection.refused.push(format!(
+            "{}: fits, but its values would have to differ by {} from stretch to stretch, {:.0} standard deviations more than noise: what is there is not constant",
+            selection.fit.model.members[index].id(),
+            percent(variation.share.sqrt()),
+            variation.deviations
+        ));
+        let without = fit::fit(bench, &selection.fit.model.without(index), None);
+        selection.fit = fit::polish(bench, &without);
+        selection.rename(bench);
+        any = true;
+    }
+    any
 }
 
 /// Takes effects out again whose values the recording does not tell; where others would do as well, the best of those whose
@@ -555,6 +592,14 @@ fn judge(
             short((rest / unavoidable).sqrt())
         ));
     }
+    if std::env::var("TWIN_DEBUG").is_ok() {
+        let v: Vec<String> = intervals::variations(bench, &selection.fit).iter().enumerate().map(|(m, v)| {
+            let without = bench.run(&selection.fit.model.without(m));
+            let own: f64 = fit::change(&selection.fit.predicted, &without).iter().map(|c| c * c).sum();
+            format!("{}:dev={:.1},h={:.5},own={:.3}", selection.fit.model.members[m].id(), v.deviations, v.share, own/explained)
+        }).collect();
+        eprintln!("DEBUG excess={:.5} z={:.1} smooth={:.5} real={} lshare={:.3} {}", (rest - allowed) / explained, (rest-allowed)/ (allowed*(2.0/count).sqrt()), left.share*rest / explained, left.is_real(), left.share, v.join(" "));
+    }
     if smooth > 0.0 || beyond > 0.0 {
         let ratio = smooth.max(beyond) / explained.max(1e-300);
         let change = fit::change(&selection.fit.predicted, &selection.plain.predicted);
@@ -584,6 +629,59 @@ fn judge(
     } else {
         Verdict::Explained
     }
+}
+
+/// The verdict once more: names whose values waver, or that leave what follows the inputs, are the best of the library and no
+/// more; and where all names were taken back for that, the mismatch is still there. True if names are doubted.
+fn doubt(
+    bench: &Workbench<'_>,
+    selection: &mut Selection,
+    verdict: Verdict,
+    left: Explainable,
+    confirmed: bool,
+    taken_back: bool,
+) -> (Verdict, bool) {
+    if taken_back && verdict == Verdict::NoMismatch {
+        selection.decisions.push(
+            "There is a mismatch, yet the only effects that take it would have to change in the course of the recording: unknown."
+                .into(),
+        );
+        return (Verdict::Unknown, false);
+    }
+    if confirmed || selection.named.is_empty() {
+        return (verdict, false);
+    }
+    let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
+    let rest = energy(&selection.fit);
+    let reach = left.share * rest / (energy(&selection.plain) - rest).max(1e-300);
+    let wavers = intervals::variations(bench, &selection.fit)
+        .into_iter()
+        .filter(|variation| variation.deviations > select::CERTAIN)
+        .fold(0.0f64, |most, variation| most.max(variation.share));
+    let doubts = [
+        (wavers > DOUBTED).then(|| {
+            format!(
+                "its values would have to differ by {} from stretch to stretch",
+                percent(wavers.sqrt())
+            )
+        }),
+        (left.is_real() && reach > DOUBTED).then(|| {
+            format!(
+                "what is left within reach of the inputs is {} of its change",
+                percent(reach.sqrt())
+            )
+        }),
+    ];
+    let doubts: Vec<String> = doubts.into_iter().flatten().collect();
+    if doubts.is_empty() {
+        return (verdict, false);
+    }
+    selection.decisions.push(format!(
+        "{}: the best of the library, yet {}: another physics of much the same shape may be behind it.",
+        selection.fit.model.ids().join(", "),
+        doubts.join(", and ")
+    ));
+    (Verdict::Ambiguous, true)
 }
 
 /// Correlation of the sizes of two series.
@@ -751,7 +849,7 @@ fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> SignalPlots
 fn sentence(
     bench: &Workbench<'_>,
     selection: &Selection,
-    verdict: Verdict,
+    (verdict, doubted): (Verdict, bool),
     left: Explainable,
     report: &Report,
 ) -> String {
@@ -792,6 +890,10 @@ fn sentence(
             } else {
                 "what remains is louder than the stated noise".to_owned()
             }
+        ),
+        Verdict::Ambiguous if doubted => format!(
+            "{name}: explained best by {} ({figures}), but not certainly: what is left has their shape.",
+            ids.join(" and ")
         ),
         Verdict::Ambiguous => format!(
             "{name}: explained by {} ({figures}); this recording cannot tell them apart.",

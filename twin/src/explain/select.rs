@@ -26,7 +26,7 @@ const FLOOR: f64 = 0.04;
 const PLACE: f64 = 0.12;
 /// Standard deviations of the stated noise that an effect has to be away from nothing: one in a thousand recordings has an effect
 /// of some thirty by chance that is 4.2 away.
-const CERTAIN: f64 = 4.2;
+pub const CERTAIN: f64 = 4.2;
 /// Rows where an effect changes the reading by at least this share of its largest change are where it acts.
 const ACTS: f64 = 0.2;
 /// Share of the held-out error from which on a single effect is clear by itself.

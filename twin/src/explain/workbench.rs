@@ -231,16 +231,16 @@ impl<'a> Workbench<'a> {
             .sum()
     }
 
-    /// Variance of a weighted sum of readings, `aᵀΣa`, under the noise that the model file states, with Σ of an exponential
-    /// memory and white noise; `None` if it states none with a memory.
-    pub fn carried(&self, weights: &[f64]) -> Option<f64> {
+    /// Variance of a weighted sum of readings from a row on, `aᵀΣa`, under the noise that the model file states, with Σ of an
+    /// exponential memory and white noise; `None` if it states none with a memory.
+    pub fn carried(&self, from: usize, weights: &[f64]) -> Option<f64> {
         let coloured = self.problem.coloured;
         if !(coloured.rms > 0.0 && coloured.tau_s > 0.0) {
             return None;
         }
         let (mut energy, mut together, mut memory) = (0.0, 0.0, 0.0);
         let mut last: Option<(f64, f64)> = None;
-        for (t, a) in self.t_s.iter().zip(weights) {
+        for (t, a) in self.t_s[from..].iter().zip(weights) {
             if let Some((before, previous)) = last {
                 memory = (memory + previous) * (-(t - before).max(0.0) / coloured.tau_s).exp();
             }
@@ -255,7 +255,7 @@ impl<'a> Workbench<'a> {
     /// on the change has the variance `cᵀΣc`. Infinite if none is stated.
     pub fn deviations(&self, change: &[f64]) -> f64 {
         let energy: f64 = change.iter().map(|c| c * c).sum();
-        match self.carried(change) {
+        match self.carried(0, change) {
             Some(variance) => energy / variance.max(1e-300).sqrt(),
             None => f64::INFINITY,
         }
