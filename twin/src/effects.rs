@@ -220,6 +220,12 @@ pub trait Effect: Sync {
         false
     }
 
+    /// The value of a parameter from which on it does what a simpler effect does (a time longer than the recording): the effect is
+    /// not named then, but an equal of what is.
+    fn endless(&self, _parameter: usize, _scale: &Scale) -> f64 {
+        f64::INFINITY
+    }
+
     /// What follows from the values, in plain words.
     fn consequences(&self, _values: &[f64], _problem: &Problem) -> Vec<String> {
         Vec::new()

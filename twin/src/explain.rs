@@ -26,6 +26,7 @@ use crate::report::data::{
 use crate::spectrum;
 use fit::Fit;
 use flexible::{Explainable, Features};
+use intervals::Variation;
 use select::{Selection, percent};
 use workbench::{Member, Model, Workbench};
 
@@ -189,8 +190,11 @@ fn one(
         })
         .collect();
     veto(&bench, &mut selection, &others);
-    let taken_back = wavering(&bench, &mut selection, &others);
     vague(&bench, &mut selection);
+    let taken_back = wavering(&bench, &mut selection, &others);
+    if taken_back {
+        vague(&bench, &mut selection);
+    }
     let left = features.explain(&selection.fit.residual, options.seed);
     let confirmed = confirmed(&selection, &others);
     let verdict = judge(
@@ -325,6 +329,11 @@ fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>
     }
 }
 
+/// Whether values would have to differ from stretch to stretch by more than noise makes them, and by much.
+fn waver(variation: &Variation) -> bool {
+    variation.deviations > select::CERTAIN && variation.share > WAVERS
+}
+
 /// Takes effects out again whose values would have to differ from stretch to stretch by more than noise makes them; true if there
 /// were any.
 fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>]) -> bool {
@@ -333,9 +342,7 @@ fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted
         let found = intervals::variations(bench, &selection.fit)
             .into_iter()
             .enumerate()
-            .filter(|(_, variation)| {
-                variation.deviations > select::CERTAIN && variation.share > WAVERS
-            })
+            .filter(|(_, variation)| waver(variation))
             .max_by(|a, b| a.1.share.total_cmp(&b.1.share));
         let Some((index, variation)) = found else {
             break;
@@ -346,9 +353,12 @@ fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted
             percent(variation.share.sqrt()),
             variation.deviations
         ));
-        let without = fit::fit(bench, &selection.fit.model.without(index), None);
-        selection.fit = fit::polish(bench, &without);
-        selection.rename(bench);
+        let steady = |fit: &Fit| {
+            intervals::variations(bench, fit)
+                .last()
+                .is_some_and(|variation| !waver(variation))
+        };
+        replace(bench, selection, index, "its values stay", &steady);
         any = true;
     }
     any
@@ -375,19 +385,31 @@ fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
         selection.refused.push(format!(
             "{id}: fits, but this recording does not tell its values: {why}"
         ));
-        let without = fit::fit(bench, &selection.fit.model.without(index), None);
-        match stand_in(bench, selection, &without.model, index) {
-            Some(better) => {
-                selection.decisions.push(format!(
-                    "{} instead of {id}: as good, and the recording tells its values.",
-                    better.model.members.last().map_or("", Member::id)
-                ));
-                selection.take(index, better);
-            }
-            None => selection.fit = fit::polish(bench, &without),
-        }
-        selection.rename(bench);
+        replace(bench, selection, index, "the recording tells its values", &|_| true);
     }
+}
+
+/// Takes an effect out of the model, or puts the best of its equals of which something holds in its place.
+fn replace(
+    bench: &Workbench<'_>,
+    selection: &mut Selection,
+    index: usize,
+    why: &str,
+    holds: &dyn Fn(&Fit) -> bool,
+) {
+    let id = selection.fit.model.members[index].id();
+    let without = fit::fit(bench, &selection.fit.model.without(index), None);
+    match stand_in(bench, selection, &without.model, index, holds) {
+        Some(better) => {
+            selection.decisions.push(format!(
+                "{} instead of {id}: as good, and {why}.",
+                better.model.members.last().map_or("", Member::id)
+            ));
+            selection.take(index, better);
+        }
+        None => selection.fit = fit::polish(bench, &without),
+    }
+    selection.rename(bench);
 }
 
 /// The best of what would have done as well in the place of an effect that was taken out, if the recording tells its values.
@@ -396,6 +418,7 @@ fn stand_in(
     selection: &Selection,
     without: &Model,
     index: usize,
+    holds: &dyn Fn(&Fit) -> bool,
 ) -> Option<Fit> {
     let named = selection.named.iter().find(|one| one.index == index)?;
     let clues = bench.clues(&selection.fit.predicted);
@@ -414,7 +437,7 @@ fn stand_in(
         .filter(|fit| {
             let last = fit.model.members.len() - 1;
             let intervals = intervals::intervals(bench, fit);
-            untold(&bench.scale, &fit.model.members[last], &intervals[last]).is_none()
+            untold(&bench.scale, &fit.model.members[last], &intervals[last]).is_none() && holds(fit)
         })
         .min_by(|a, b| a.cost.total_cmp(&b.cost))
         .map(|fit| fit::polish(bench, &fit))

@@ -393,6 +393,18 @@ fn obstacle(
     index: usize,
     gain: f64,
 ) -> Option<String> {
+    hindrance(bench, before, after, index, gain, false)
+}
+
+/// The same; an equal of another effect may be what that one is by a value beyond what the recording tells.
+fn hindrance(
+    bench: &Workbench<'_>,
+    before: &Fit,
+    after: &Fit,
+    index: usize,
+    gain: f64,
+    equal: bool,
+) -> Option<String> {
     let member = &after.model.members[index];
     let card = member.effect.card();
     let without = bench.run(&after.model.without(index));
@@ -461,6 +473,13 @@ fn obstacle(
     {
         let (low, high) = member.effect.bounds(p, &bench.scale);
         let value = member.values[p];
+        let endless = member.effect.endless(p, &bench.scale);
+        if value >= endless && !equal {
+            return Some(format!(
+                "{} would be {value:.4}, more than the recording tells",
+                parameter.name
+            ));
+        }
         let margin = match parameter.search {
             Search::Logarithmic => value * 0.01,
             _ => 1e-4 * (high - low),
@@ -475,6 +494,7 @@ fn obstacle(
         if let Some(end) = end
             && end != 0.0
             && !parameter.open
+            && value < endless
         {
             return Some(format!(
                 "{} would be at the end of what is physics, {end:.4}",
@@ -799,7 +819,7 @@ fn name(
                 .filter(|(_, other)| {
                     let last = other.model.members.len() - 1;
                     !beaten(bench, other, now)
-                        && obstacle(bench, &without, other, last, 1.0).is_none()
+                        && hindrance(bench, &without, other, last, 1.0, true).is_none()
                 })
                 .filter_map(|(_, other)| other.model.members.last().map(Member::id))
                 .collect();
@@ -830,7 +850,10 @@ fn beaten(bench: &Workbench<'_>, other: &Fit, chosen: &Fit) -> bool {
     let mean = differences.iter().sum::<f64>() / count;
     let variance =
         differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
-    mean > BEATEN * (variance / count).sqrt()
+    // Noise with a memory tells two models apart by no more than what it does along their difference, however many the rows.
+    let apart = change(&other.predicted, &chosen.predicted);
+    let stated = bench.carried(0, &apart).unwrap_or(0.0).sqrt() / (sigma * sigma * count);
+    mean > BEATEN * (variance / count).sqrt().max(stated)
 }
 
 /// Whether a model owes what it gains to the alignment of samples that its effect sets free, and not to the effect.
