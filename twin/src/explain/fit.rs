@@ -679,7 +679,10 @@ fn search_steps(
                 found = true;
             }
         }
-        if effect.near(&model.members[m].values, &bench.scale, 0.0).is_some() {
+        if effect
+            .near(&model.members[m].values, &bench.scale, 0.0)
+            .is_some()
+        {
             continue;
         }
         for (p, _) in effect

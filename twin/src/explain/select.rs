@@ -477,6 +477,7 @@ fn obstacle(
         if let Some(end) = end
             && end != 0.0
             && !parameter.open
+            && !(parameter.from_bottom && end == low)
         {
             return Some(format!(
                 "{} would be at the end of what is physics, {end:.4}",

@@ -10,7 +10,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 
 use crate::effects::chain::{Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
-use crate::effects::{Clues, Effect, LIBRARY, Stage};
+use crate::effects::{Clues, Effect, LIBRARY, Parameter, Stage};
 use crate::problem::{Base, Problem, View};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row).
@@ -159,12 +159,14 @@ impl<'a> Workbench<'a> {
         };
         let scale = scale(problem, &t_s, &y, &plain);
         let blocks = blocks(&rows);
+        let quasi_static = matches!(&problem.base, Base::Sensor(base) if base.quasi_static);
         let library = LIBRARY
             .iter()
             .copied()
             .filter(|effect| {
                 let id = effect.card().id;
                 effect.applies(problem)
+                    && !(quasi_static && effect.card().parameters.iter().any(Parameter::timed))
                     && !without.iter().any(|name| name == id)
                     && !problem.modelled.iter().any(|(known, _)| *known == id)
             })
@@ -259,6 +261,11 @@ impl<'a> Workbench<'a> {
             Some(variance) => energy / variance.max(1e-300).sqrt(),
             None => f64::INFINITY,
         }
+    }
+
+    /// Whether time means nothing in this recording.
+    pub fn quasi_static(&self) -> bool {
+        matches!(&self.problem.base, Base::Sensor(base) if base.quasi_static)
     }
 
     /// The simulation at the rows that count.
