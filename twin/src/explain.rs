@@ -233,9 +233,7 @@ fn one(
     };
     attribute(&bench, &selection.fit, &mut locations);
     report.locations.extend(locations);
-    report
-        .effects
-        .extend(effects(&bench, &selection));
+    report.effects.extend(effects(&bench, &selection));
     report
         .holdouts
         .extend(others.iter().map(|other| HoldoutReport {

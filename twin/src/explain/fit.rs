@@ -19,6 +19,8 @@ const STEPS: usize = 14;
 const SLOW: f64 = 5e-3;
 /// A step with a new slope that lowers the loss by a smaller share is the last.
 const ENOUGH: f64 = 1e-4;
+/// How far away values without a slope are tried.
+const SHARES: [f64; 8] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5];
 
 /// A fit of more rows than this does not keep its slope: memory stays linear in the recording, with a small factor.
 const KEPT_ROWS: usize = 40_000;
@@ -648,6 +650,41 @@ fn search_steps(
     let mut found = false;
     for m in 0..model.members.len() {
         let effect = model.members[m].effect;
+        // Where values depend on one another they are moved together.
+        for share in SHARES {
+            for _ in 0..4 {
+                let Some(near) = effect.near(&model.members[m].values, &bench.scale, share) else {
+                    break;
+                };
+                let mut better = false;
+                for mut values in near {
+                    for (p, value) in values.iter_mut().enumerate() {
+                        let (low, high) = effect.bounds(p, &bench.scale);
+                        *value = value.clamp(low, high);
+                    }
+                    let mut moved = model.clone();
+                    moved.members[m].values = values;
+                    let there_predicted = bench.run(&moved);
+                    let there_residual = bench.residual(&there_predicted);
+                    let there = cost(bench, &moved, &there_residual, sigma, used);
+                    if there < here {
+                        (*model, *predicted, *residual) = (moved, there_predicted, there_residual);
+                        here = there;
+                        better = true;
+                    }
+                }
+                if !better {
+                    break;
+                }
+                found = true;
+            }
+        }
+        if effect
+            .near(&model.members[m].values, &bench.scale, 0.0)
+            .is_some()
+        {
+            continue;
+        }
         for (p, _) in effect
             .card()
             .parameters
@@ -658,7 +695,7 @@ fn search_steps(
             })
             .collect::<Vec<_>>()
         {
-            for share in [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5] {
+            for share in SHARES {
                 for _ in 0..4 {
                     let mut better = false;
                     for sign in [1.0, -1.0] {

@@ -41,6 +41,8 @@ const SMALL: f64 = 0.2;
 const STRETCHES: usize = 200;
 /// A model is beaten if another's held-out loss is lower by this many standard errors of their paired difference.
 const BEATEN: f64 = 2.0;
+/// An effect would do as well as another if it takes at least this share of what that one takes.
+const EQUAL: f64 = 0.5;
 
 /// A named effect and what speaks for it.
 #[derive(Clone, Debug)]
@@ -495,6 +497,7 @@ fn hindrance(
             && end != 0.0
             && !parameter.open
             && value < endless
+            && !(parameter.from_bottom && end == low)
         {
             return Some(format!(
                 "{} would be at the end of what is physics, {end:.4}",
@@ -813,12 +816,16 @@ fn name(
         .map(|index| {
             let id = now.model.members[index].id();
             let without = fit(bench, &now.model.without(index), None);
+            let taken = share(bench, &without, now);
+            // Where few rows decide, the difference of two models is never certain: who takes much less is no equal.
+            let least = (EQUAL * taken).max(p99_of(step_p99, id));
             let mut equivalent: Vec<&'static str> = others
                 .iter()
                 .filter(|(at, _)| *at == index)
                 .filter(|(_, other)| {
                     let last = other.model.members.len() - 1;
-                    !beaten(bench, other, now)
+                    share(bench, &without, other) >= least
+                        && !beaten(bench, other, now)
                         && hindrance(bench, &without, other, last, 1.0, true).is_none()
                 })
                 .filter_map(|(_, other)| other.model.members.last().map(Member::id))
@@ -827,7 +834,7 @@ fn name(
             equivalent.dedup();
             Named {
                 index,
-                held_out_gain: share(bench, &without, now),
+                held_out_gain: taken,
                 placebo_p99: p99_of(step_p99, id),
                 equivalent,
             }

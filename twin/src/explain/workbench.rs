@@ -10,7 +10,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 
 use crate::effects::chain::{Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
-use crate::effects::{Clues, Effect, LIBRARY, Stage};
+use crate::effects::{Clues, Effect, LIBRARY, Parameter, Stage};
 use crate::problem::{Base, Problem, View};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row).
@@ -159,12 +159,14 @@ impl<'a> Workbench<'a> {
         };
         let scale = scale(problem, &t_s, &y, &plain);
         let blocks = blocks(&rows);
+        let quasi_static = matches!(&problem.base, Base::Sensor(base) if base.quasi_static);
         let library = LIBRARY
             .iter()
             .copied()
             .filter(|effect| {
                 let id = effect.card().id;
                 effect.applies(problem)
+                    && !(quasi_static && effect.card().parameters.iter().any(Parameter::timed))
                     && !without.iter().any(|name| name == id)
                     && !problem.modelled.iter().any(|(known, _)| *known == id)
             })
@@ -261,6 +263,11 @@ impl<'a> Workbench<'a> {
         }
     }
 
+    /// Whether time means nothing in this recording.
+    pub fn quasi_static(&self) -> bool {
+        matches!(&self.problem.base, Base::Sensor(base) if base.quasi_static)
+    }
+
     /// The simulation at the rows that count.
     pub fn run(&self, model: &Model) -> Vec<f64> {
         self.thinned(self.everywhere(model))
@@ -308,7 +315,9 @@ impl<'a> Workbench<'a> {
     pub fn aligns(&self, model: &Model) -> bool {
         matches!(self.problem.base, Base::Sensor(_))
             && !model.unaligned
+            // These have a time of their own.
             && !model.has("delay")
+            && !model.has("sampled-window")
             && model.members.iter().any(|member| {
                 matches!(member.effect.card().stage, Stage::Filter | Stage::Converter)
             })
@@ -390,6 +399,12 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         mismatch: rms(y.iter().zip(plain).map(|(y, p)| y - p)),
         step_s: drive.median_step_s(),
         reading_step_s,
+        even_s: match t_s {
+            [first, .., last] if reading_step_s > 0.0 => {
+                (last - first) / ((last - first) / reading_step_s).round().max(1.0)
+            }
+            _ => reading_step_s,
+        },
         fastest_s: 0.02 * drive.median_step_s().min(reading_step_s),
         span_s,
         ..Scale::default()
