@@ -40,13 +40,14 @@ use crate::problem::{Problem, View};
 use scene::{Scale, Scene};
 
 /// Every effect, in the order of the documentation's table.
-pub static LIBRARY: [&dyn Effect; 32] = [
+pub static LIBRARY: [&dyn Effect; 33] = [
     &offset::Offset,
     &gain::Gain,
     &offset_temperature::OffsetTemperature,
     &gain_temperature::GainTemperature,
     &supply_ratiometric::SupplyRatiometric,
-    &core_hysteresis::CoreHysteresis,
+    &core_hysteresis::GAPPED,
+    &core_hysteresis::CLOSED,
     &core_saturation::CoreSaturation,
     &clipping::Clipping,
     &lag::Lag,
@@ -103,6 +104,8 @@ pub struct Parameter {
     pub internal: bool,
     /// The end of its bounds is a value like any other (a rail out of reach, a window without a pause).
     pub open: bool,
+    /// Its lower end is a value like any other (a curve that bends from the start has no knee).
+    pub from_bottom: bool,
 }
 
 impl Parameter {
@@ -114,7 +117,13 @@ impl Parameter {
             search,
             internal: false,
             open: false,
+            from_bottom: false,
         }
+    }
+
+    const fn from_bottom(mut self) -> Self {
+        self.from_bottom = true;
+        self
     }
 
     const fn open(mut self) -> Self {
@@ -130,7 +139,13 @@ impl Parameter {
             search,
             internal: true,
             open: false,
+            from_bottom: false,
         }
+    }
+
+    /// Whether it is a time, or goes by one.
+    pub fn timed(&self) -> bool {
+        matches!(self.unit, "s" | "Hz" | "ppm" | "rad")
     }
 }
 
@@ -139,8 +154,10 @@ impl Parameter {
 pub enum Stage {
     /// What flows in, and beside, the conductor.
     Conductor,
-    /// The sensor's magnetic core.
+    /// The memory of the sensor's magnetic core: the field that the current has to overcome.
     Core,
+    /// What the core's flux is limited to.
+    Saturation,
     /// The sensor's sensitivity and zero.
     Sensor,
     /// Time stamps: from when a reading is.
@@ -204,14 +221,37 @@ pub trait Effect: Sync {
     /// Changes the scene.
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>);
 
+    /// Values to be tried around `values`, for parameters that are searched without derivatives and depend on one another; `share`
+    /// says how far away. `None`: each by itself.
+    fn near(&self, _values: &[f64], _scale: &Scale, _share: f64) -> Option<Vec<Vec<f64>>> {
+        None
+    }
+
     /// What the readings show by themselves, whatever the simulation says.
     fn mark(&self, _scale: &Scale, _clues: &Clues<'_>) -> Option<Mark> {
         None
     }
 
+    /// Whether it is another form of the effect of the same id, and no more of it: it may be named without the smaller one.
+    fn alternative(&self) -> bool {
+        false
+    }
+
     /// Share of its own change by which its equation may be off: most are idealisations of what happens.
     fn idealised(&self) -> f64 {
         IDEALISED
+    }
+
+    /// Whether the loss has a kink in a parameter (an end, a threshold, the start of a window): its interval is then found by
+    /// profile likelihood, not from slopes.
+    fn kinked(&self, _parameter: usize) -> bool {
+        false
+    }
+
+    /// The value of a parameter from which on it does what a simpler effect does (a time longer than the recording): the effect is
+    /// not named then, but an equal of what is.
+    fn endless(&self, _parameter: usize, _scale: &Scale) -> f64 {
+        f64::INFINITY
     }
 
     /// What follows from the values, in plain words.
@@ -309,7 +349,10 @@ mod tests {
             ("offset-temperature", &["tc_a_per_k"]),
             ("gain-temperature", &["tc_per_k"]),
             ("supply-ratiometric", &["ratio"]),
-            ("core-hysteresis", &["remanence_a", "coercivity_a"]),
+            (
+                "core-hysteresis",
+                &["remanence_a", "coercivity_a", "spread"],
+            ),
             ("core-saturation", &["knee_a", "softness"]),
             ("clipping", &["high_a", "low_a"]),
             ("lag", &["tau_s"]),

@@ -309,6 +309,7 @@ impl Work<'_> {
             full_scale: sensor.full_scale,
             range_limit: sensor.range_limit,
             held_reference: sensor.held_reference,
+            quasi_static: sensor.quasi_static,
             alignment_s: sensor.alignment_s,
             ..SensorBase::default()
         };

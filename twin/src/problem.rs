@@ -89,6 +89,8 @@ pub struct SensorBase {
     pub range_limit: Option<f64>,
     /// True if the reference stays at its value until its next row instead of going there in a straight line.
     pub held_reference: bool,
+    /// True if the recording's time means nothing (a loop measured point by point): no effect goes by the clock.
+    pub quasi_static: bool,
 }
 
 /// A battery as designed: open-circuit voltage and ohmic resistance.

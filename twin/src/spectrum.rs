@@ -135,6 +135,36 @@ pub fn lines(t_s: &[f64], values: &[f64], step_s: f64) -> Vec<Line> {
         .collect()
 }
 
+/// Frequencies in Hz of the strongest peaks, strongest first, whether they stand out or not.
+pub fn strongest(t_s: &[f64], values: &[f64], step_s: f64, count: usize) -> Vec<f64> {
+    let Some((mut grid, _, _)) = grid(t_s, values, step_s) else {
+        return Vec::new();
+    };
+    let length = 2 * grid.len();
+    grid.resize(length, Complex::new(0.0, 0.0));
+    FftPlanner::new()
+        .plan_fft_forward(length)
+        .process(&mut grid);
+    let power: Vec<f64> = grid[..length / 2].iter().map(Complex::norm_sqr).collect();
+    let mut peaks: Vec<usize> = (1..power.len().saturating_sub(1))
+        .filter(|&at| power[at] > power[at - 1] && power[at] >= power[at + 1])
+        .collect();
+    peaks.sort_unstable_by(|a, b| power[*b].total_cmp(&power[*a]));
+    let mut apart: Vec<usize> = Vec::new();
+    for at in peaks {
+        if apart.iter().all(|other| other.abs_diff(at) > 8) {
+            apart.push(at);
+        }
+        if apart.len() == count {
+            break;
+        }
+    }
+    apart
+        .into_iter()
+        .map(|at| at as f64 / (length as f64 * step_s))
+        .collect()
+}
+
 /// Amplitude spectral density in `bands` bands of equal width on a logarithmic axis: lower and upper end in Hz, and unit/√Hz.
 pub fn density(t_s: &[f64], values: &[f64], step_s: f64, bands: usize) -> Vec<(f64, f64, f64)> {
     let Some((mut grid, _, filled)) = grid(t_s, values, step_s) else {

@@ -5,6 +5,15 @@ use crate::spectrum;
 
 use super::{Card, Clues, Effect, Parameter, Search, Stage};
 
+/// Rows that the course of the delay is fitted to.
+const ENOUGH: usize = 4000;
+/// Lines in the course of the delay that are followed: a load with a rhythm of its own has many beside the right one.
+const LINES: usize = 16;
+/// The best of them.
+const BEST: usize = 4;
+/// Cycles that the age of a reading goes through in a recording at least: with fewer it is a delay.
+const CYCLES: f64 = 6.0;
+
 /// See [`CARD`].
 #[derive(Debug)]
 pub struct SampledWindow;
@@ -19,7 +28,7 @@ static CARD: Card = Card {
         Parameter::internal("phase_s", "s", 0.0, Search::Stepped),
     ],
     shows: "beats with periodic loads",
-    looks_like: &["moving-average", "gain"],
+    looks_like: &["moving-average", "delay", "lag", "gain"],
     separated_by: "a load that switches with a period near that of the window",
     stage: Stage::Converter,
 };
@@ -31,7 +40,7 @@ impl Effect for SampledWindow {
 
     fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64) {
         match parameter {
-            0 => (2.5 * scale.step_s, 0.1 * scale.span_s),
+            0 => (2e-3 * scale.step_s, 0.1 * scale.span_s),
             1 => (0.01, 1.0),
             _ => (-scale.span_s, scale.span_s),
         }
@@ -47,8 +56,9 @@ impl Effect for SampledWindow {
                     .map(|pair| (pair[1] - pair[0]).abs()),
             )
             .collect();
-        let (lowest, highest) = self.bounds(0, scale);
-        let mut starts = Vec::new();
+        let lowest = 2.5 * scale.step_s;
+        let (_, highest) = self.bounds(0, scale);
+        let mut starts = by_age(clues, scale);
         for line in spectrum::lines(clues.t_s, &moves, scale.reading_step_s) {
             for multiple in [1.0, 2.0] {
                 let period = multiple / line.frequency_hz;
@@ -67,6 +77,38 @@ impl Effect for SampledWindow {
             }
         }
         starts
+    }
+
+    fn near(&self, values: &[f64], scale: &Scale, share: f64) -> Option<Vec<Vec<f64>>> {
+        let (period, duty, phase) = (values[0], values[1], values[2]);
+        let span = scale.span_s.max(period);
+        let along = |by: [f64; 3]| {
+            [share, -share].map(|share| {
+                let moved = values.iter().zip(by);
+                moved.map(|(value, by)| value + share * by).collect()
+            })
+        };
+        let mut near: Vec<Vec<f64>> = [
+            // The period, with the windows in the middle of the recording where they are.
+            [4.0 * period * period / span, 0.0, -2.0 * period],
+            // All windows.
+            [0.0, 0.0, 2.0 * period],
+            // Where windows begin, and where they end.
+            [0.0, duty, -duty * period],
+            [0.0, duty, 0.0],
+        ]
+        .into_iter()
+        .flat_map(along)
+        .collect();
+        // Another period by which readings are as old at their rows.
+        let age = (-(phase / period + duty)).rem_euclid(1.0);
+        for rate in [1.0, -1.0].map(|turns| 1.0 / period + turns / scale.even_s) {
+            if rate > 0.0 {
+                let mean = 0.5 * period * (1.0 + duty);
+                near.push(seen(1.0 / rate, mean, age));
+            }
+        }
+        Some(near)
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
@@ -106,4 +148,105 @@ impl Effect for SampledWindow {
         }
         scene.signal = output;
     }
+}
+
+/// Values for windows of a period, from the mean time by which readings are late, and the age of the first reading in periods.
+fn seen(period: f64, late_s: f64, age: f64) -> Vec<f64> {
+    let duty = (2.0 * late_s / period - 1.0).clamp(0.05, 1.0);
+    vec![period, duty, -(duty + age) * period]
+}
+
+/// Starts from how late readings are: by half a window, and by their age, which rises from nothing to a period and falls back. At
+/// the rows it does so at a beat of the period with them, also where the period is much shorter than a row.
+fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
+    let step = scale.even_s;
+    let [.., t_last] = clues.t_s else {
+        return Vec::new();
+    };
+    let (t_first, span) = (clues.t_s[0], t_last - clues.t_s[0]);
+    if !(step > 0.0 && span > 20.0 * step) {
+        return Vec::new();
+    }
+    // A reading that is late by d is off by −d·di/dt.
+    let (mut t_s, mut off, mut rate) = (Vec::new(), Vec::new(), Vec::new());
+    for row in 1..clues.t_s.len() {
+        let h = clues.t_s[row] - clues.t_s[row - 1];
+        let slope = (clues.predicted[row - 1] - clues.predicted[row]) / h;
+        let error = clues.observed[row] - clues.predicted[row];
+        if h > 0.0 && h < 1.5 * step && slope.is_finite() && error.is_finite() {
+            t_s.push(clues.t_s[row] - t_first);
+            off.push(error);
+            rate.push(slope);
+        }
+    }
+    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let all = product(&rate, &rate);
+    if all.is_nan() || all <= 0.0 {
+        return Vec::new();
+    }
+    let late_s = product(&off, &rate) / all;
+    let course: Vec<f64> = off
+        .iter()
+        .zip(&rate)
+        .map(|(off, rate)| (off - late_s * rate) * rate)
+        .collect();
+    let stride = t_s.len().div_ceil(ENOUGH).max(1);
+    let rows = || (0..t_s.len()).step_by(stride);
+    let mut found: Vec<(f64, [f64; 4])> = Vec::new();
+    for line in spectrum::strongest(&t_s, &course, step, LINES) {
+        if line * span < CYCLES {
+            continue;
+        }
+        let mut best: Option<(f64, [f64; 4])> = None;
+        for beat in [-0.5, -0.25, 0.0, 0.25, 0.5].map(|by| line + by / span) {
+            let (mut sine, mut cosine) = (0.0, 0.0);
+            for row in rows() {
+                let turn = std::f64::consts::TAU * beat * t_s[row];
+                sine += course[row] * turn.sin();
+                cosine += course[row] * turn.cos();
+            }
+            let turns = f64::atan2(-sine, cosine) / std::f64::consts::TAU;
+            // Ages rise at the beat, or fall: where the period is a little shorter, or longer, than what fits into a row.
+            for (way, phase) in [(1.0, turns - 0.25), (-1.0, -turns - 0.25)] {
+                for phase in [phase - 0.04, phase, phase + 0.04] {
+                    let (mut rr, mut ra, mut aa, mut or, mut oa) = (0.0, 0.0, 0.0, 0.0, 0.0);
+                    for row in rows() {
+                        let turns = way * beat * t_s[row] + phase;
+                        let age = rate[row] * (turns - floored(turns));
+                        rr += rate[row] * rate[row];
+                        ra += rate[row] * age;
+                        aa += age * age;
+                        or += off[row] * rate[row];
+                        oa += off[row] * age;
+                    }
+                    let whole = rr * aa - ra * ra;
+                    if whole <= 0.0 {
+                        continue;
+                    }
+                    let period = (oa * rr - or * ra) / whole;
+                    let least = (or * aa - oa * ra) / whole;
+                    let gain = period * oa + least * or;
+                    if period > 0.0 && best.is_none_or(|(most, _)| gain > most) {
+                        best = Some((gain, [way * beat, phase, period, least]));
+                    }
+                }
+            }
+        }
+        found.extend(best);
+    }
+    found.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let mut starts = Vec::new();
+    for (_, [beat, phase, period, least]) in found.into_iter().take(BEST) {
+        let late_s = least + 0.5 * period;
+        let age = phase.rem_euclid(1.0);
+        // The beat is the period's rate less a whole number of times that of the rows.
+        let nearest = ((1.0 / period - beat) * step).round();
+        for turns in [nearest - 1.0, nearest, nearest + 1.0] {
+            let rate = beat + turns / step;
+            if rate > 0.0 && 1.0 / rate < 0.1 * span && late_s > 0.0 {
+                starts.push(seen(1.0 / rate, late_s, age));
+            }
+        }
+    }
+    starts
 }

@@ -31,6 +31,8 @@ pub struct Scale {
     pub step_s: f64,
     /// Median step of the readings that count, in s.
     pub reading_step_s: f64,
+    /// The same as a whole part of the time covered, in s: where steps are even, it keeps in step over the recording.
+    pub even_s: f64,
     /// Time covered in s; of the longest segment.
     pub span_s: f64,
     /// Capacity of the battery in Ah, 0 without one.
@@ -52,6 +54,8 @@ pub struct Scene<'a> {
     pub observed: &'a Observed,
     /// Steps of the drive's rows.
     pub steps: Arc<Steps>,
+    /// Changes of the range, in order.
+    pub changes: Arc<Vec<RangeChange>>,
     /// The signal: on drive rows before [`super::Stage::Output`], then on the observation's rows.
     pub signal: Vec<f64>,
     /// Transport delay in s.
@@ -122,6 +126,111 @@ pub struct Battery<'a> {
     pub factor: Series,
     /// Voltage added to open circuit and ohmic drop, in V.
     pub added_v: Vec<f64>,
+}
+
+/// A change of the range in use.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RangeChange {
+    /// The first row after it.
+    pub row: usize,
+    /// Time in s from the change to that row.
+    pub since_s: f64,
+    /// Whether it is to the large range.
+    pub high: bool,
+}
+
+/// Changes of the range with their instants: where the reference crosses the limit between two rows.
+///
+/// The limits, one on the way up and one on the way down (a hysteresis), are those that the fewest rows contradict. A current
+/// that reverses between two rows of the large range passes through the small one.
+fn range_changes(drive: &Drive, sensor: Option<&SensorBase>) -> Vec<RangeChange> {
+    let (Some(flag), Some(sensor)) = (&drive.range_high, sensor) else {
+        return Vec::new();
+    };
+    let size = |row: usize| drive.reference[row].abs();
+    let high = |row: usize| flag[row] > 0.5;
+    let steps = || {
+        let segments = drive.segments.iter().filter(|rows| !rows.is_empty());
+        segments.flat_map(|rows| rows.start + 1..rows.end)
+    };
+    // Of each way: sizes that the limit is above, and sizes that it is below.
+    let (mut up, mut down) = ((Vec::new(), Vec::new()), (Vec::new(), Vec::new()));
+    for row in steps() {
+        match (high(row - 1), high(row)) {
+            (false, false) => up.0.push(size(row)),
+            (false, true) => up.1.push(size(row)),
+            (true, true) => down.1.push(size(row)),
+            (true, false) => down.0.push(size(row)),
+        }
+    }
+    if up.1.is_empty() || down.0.is_empty() {
+        return Vec::new();
+    }
+    let up = limit(up.0, up.1, sensor.range_limit);
+    let down = limit(down.0, down.1, None);
+    let mut changes = Vec::new();
+    for row in steps() {
+        let h = (drive.t_s[row] - drive.t_s[row - 1]).max(0.0);
+        let (from, to) = (drive.reference[row - 1], drive.reference[row]);
+        // A held reference jumps: when within the step, nobody knows.
+        let since_s = |limit: f64| {
+            if sensor.held_reference || from == to {
+                0.5 * h
+            } else {
+                h * ((to - limit) / (to - from)).clamp(0.0, 1.0)
+            }
+        };
+        let rises = RangeChange {
+            row,
+            since_s: since_s(up.copysign(to)),
+            high: true,
+        };
+        let falls = RangeChange {
+            row,
+            since_s: since_s(down.copysign(from)),
+            high: false,
+        };
+        match (high(row - 1), high(row)) {
+            (false, true) => changes.push(rises),
+            (true, false) => changes.push(falls),
+            (true, true) if from * to < 0.0 && !sensor.held_reference => {
+                changes.extend([falls, rises]);
+            }
+            _ => (),
+        }
+    }
+    changes
+}
+
+/// The value that the fewest of some values lie on the wrong side of (those of `below` are said to be below it); of equals the
+/// one by design.
+fn limit(mut below: Vec<f64>, mut above: Vec<f64>, design: Option<f64>) -> f64 {
+    below.sort_unstable_by(f64::total_cmp);
+    above.sort_unstable_by(f64::total_cmp);
+    let mut edges: Vec<f64> = below.iter().chain(&above).copied().collect();
+    edges.sort_unstable_by(f64::total_cmp);
+    edges.dedup();
+    let (mut b, mut a) = (0, 0);
+    let mut best = (usize::MAX, 0.0);
+    for pair in edges.windows(2) {
+        while below.get(b).is_some_and(|value| *value <= pair[0]) {
+            b += 1;
+        }
+        while above.get(a).is_some_and(|value| *value <= pair[0]) {
+            a += 1;
+        }
+        let wrong = below.len() - b + a;
+        if wrong < best.0 {
+            best = (wrong, 0.5 * (pair[0] + pair[1]));
+        }
+    }
+    let wrong = |limit: f64| {
+        let below = below.len() - below.partition_point(|value| *value <= limit);
+        below + above.partition_point(|value| *value <= limit)
+    };
+    design
+        .filter(|design| wrong(*design) <= best.0)
+        .unwrap_or(best.1)
 }
 
 /// Steps between the drive's rows, told apart to a nanosecond (differences of times carry rounding). Steps repeat, with some
@@ -478,6 +587,7 @@ impl<'a> Scene<'a> {
             drive,
             observed: &problem.observed,
             steps: Arc::new(Steps::new(&drive.t_s, &drive.segments)),
+            changes: Arc::new(range_changes(drive, sensor)),
             signal: drive.reference.clone(),
             delay_s: 0.0,
             skew: 0.0,

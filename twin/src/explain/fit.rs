@@ -19,6 +19,8 @@ const STEPS: usize = 14;
 const SLOW: f64 = 5e-3;
 /// A step with a new slope that lowers the loss by a smaller share is the last.
 const ENOUGH: f64 = 1e-4;
+/// How far away values without a slope are tried.
+const SHARES: [f64; 8] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5];
 
 /// A fit of more rows than this does not keep its slope: memory stays linear in the recording, with a small factor.
 const KEPT_ROWS: usize = 40_000;
@@ -161,28 +163,20 @@ impl Slope {
         model
     }
 
-    /// Value of a member's parameter if its coordinate were moved by `delta`; `None` if it is not free.
-    pub fn value_at(
-        &self,
-        member: usize,
-        parameter: usize,
-        model: &Model,
-        deltas: &[f64],
-    ) -> Option<f64> {
-        self.coordinates
-            .iter()
-            .zip(deltas)
-            .find_map(|(coordinate, delta)| match coordinate {
-                Coordinate::Value(m, p, logarithmic) if (*m, *p) == (member, parameter) => {
-                    let value = model.members[member].values[parameter];
-                    Some(if *logarithmic {
-                        value * delta.exp()
-                    } else {
-                        value + delta
-                    })
-                }
-                _ => None,
-            })
+    /// Where a member's parameter is among the coordinates; `None` if it is not free. The coordinate of a
+    /// [`Search::Logarithmic`] one is its logarithm.
+    pub fn index(&self, member: usize, parameter: usize) -> Option<usize> {
+        self.coordinates.iter().position(
+            |coordinate| matches!(coordinate, Coordinate::Value(m, p, _) if (*m, *p) == (member, parameter)),
+        )
+    }
+
+    /// What the model file says of the base, as normal equations.
+    pub fn prior(&self) -> (DMatrix<f64>, DVector<f64>) {
+        let mut normal = DMatrix::zeros(self.len(), self.len());
+        let mut right = DVector::zeros(self.len());
+        self.penalty(&mut normal, &mut right);
+        (normal, right)
     }
 
     /// Carries the slope along a step (Broyden's update): cheaper than a new one, and nearly as good for small steps.
@@ -267,6 +261,7 @@ fn coordinates(bench: &Workbench<'_>, model: &Model) -> Vec<(Coordinate, f64, f6
             let (low, high) = member.effect.bounds(p, &bench.scale);
             let (logarithmic, step) = match parameter.search {
                 Search::Stepped => continue,
+                _ if model.held == Some((m, p)) => continue,
                 Search::Logarithmic => (true, 1e-3),
                 Search::Linear => {
                     let off = if parameter.off.is_finite() {
@@ -655,14 +650,52 @@ fn search_steps(
     let mut found = false;
     for m in 0..model.members.len() {
         let effect = model.members[m].effect;
+        // Where values depend on one another they are moved together.
+        for share in SHARES {
+            for _ in 0..4 {
+                let Some(near) = effect.near(&model.members[m].values, &bench.scale, share) else {
+                    break;
+                };
+                let mut better = false;
+                for mut values in near {
+                    for (p, value) in values.iter_mut().enumerate() {
+                        let (low, high) = effect.bounds(p, &bench.scale);
+                        *value = value.clamp(low, high);
+                    }
+                    let mut moved = model.clone();
+                    moved.members[m].values = values;
+                    let there_predicted = bench.run(&moved);
+                    let there_residual = bench.residual(&there_predicted);
+                    let there = cost(bench, &moved, &there_residual, sigma, used);
+                    if there < here {
+                        (*model, *predicted, *residual) = (moved, there_predicted, there_residual);
+                        here = there;
+                        better = true;
+                    }
+                }
+                if !better {
+                    break;
+                }
+                found = true;
+            }
+        }
+        if effect
+            .near(&model.members[m].values, &bench.scale, 0.0)
+            .is_some()
+        {
+            continue;
+        }
         for (p, _) in effect
             .card()
             .parameters
             .iter()
             .enumerate()
-            .filter(|(_, parameter)| parameter.search == Search::Stepped)
+            .filter(|(p, parameter)| {
+                parameter.search == Search::Stepped && model.held != Some((m, *p))
+            })
+            .collect::<Vec<_>>()
         {
-            for share in [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5] {
+            for share in SHARES {
                 for _ in 0..4 {
                     let mut better = false;
                     for sign in [1.0, -1.0] {
@@ -715,14 +748,18 @@ pub struct Blocked {
     pub rights: Vec<DVector<f64>>,
 }
 
+/// Huber's weights of residuals, in units of 1/sigma².
+pub fn weights(residual: &[f64], sigma: f64) -> Vec<f64> {
+    residual
+        .iter()
+        .map(|r| weight(r / sigma) / (sigma * sigma))
+        .collect()
+}
+
 /// Looks at a fit block by block, with Huber's weights at `sigma`.
 pub fn blocked(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Blocked {
     let slope = fit.slope(bench);
-    let weights: Vec<f64> = fit
-        .residual
-        .iter()
-        .map(|r| weight(r / sigma) / (sigma * sigma))
-        .collect();
+    let weights = weights(&fit.residual, sigma);
     let (matrices, rights) = bench
         .blocks
         .iter()

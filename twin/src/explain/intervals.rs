@@ -1,100 +1,354 @@
-//! 95 % intervals of a model's values by block bootstrap: blocks of rows are drawn with replacement, so that the colour of the
-//! noise counts; each draw is one Gauss–Newton step from the whole fit.
+//! 95 % intervals of a model's values.
+//!
+//! Each has two estimates of its standard error, and the wider interval of the two is said:
+//!
+//! - *By stretches*: the recording in contiguous stretches, each left out in turn (the jackknife form of the cluster-robust
+//!   covariance, "CR3"; MacKinnon, Nielsen and Webb 2023, *J. Econometrics* 232, 272), with Student's t for as many degrees of
+//!   freedom as stretches tell the value (Bell and McCaffrey 2002). It holds for noise of any colour that is short against a
+//!   stretch, and for a model that is a little wrong.
+//! - *By the stated noise*: the fit's own weights carried through the noise that the model file states, its memory with it; where
+//!   none is stated, through white noise as loud as what is left. A memory as long as the recording shows in no stretch.
+//!
+//! Where the loss has a kink in a value (an effect says so, [`crate::effects::Effect::kinked`]) or jumps with it, neither holds:
+//! the value is moved, the others are fitted again, and the interval ends where the loss has risen by what bounds 95 %
+//! (profile likelihood), with as many observations as the noise's memory leaves (Rao and Scott's correction).
+
+use std::ops::Range;
 
 use nalgebra::{DMatrix, DVector};
-use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 
-use super::fit::{Fit, blocked, loss, solve};
-use super::workbench::Workbench;
-use crate::effects::Search;
+use super::fit::{Fit, Slope, change, dot, fit as refit, loss, normal, solve, weights};
+use super::workbench::{Model, Workbench};
+use crate::effects::{Parameter, Search};
 
-/// Bootstrap draws.
-const DRAWS: usize = 1000;
+/// 97.5th percentile of the normal distribution.
+const NORMAL: f64 = 1.96;
+/// Degrees of freedom below which an estimate by stretches tells nothing: too few stretches show the value.
+const LEAST_FREEDOM: f64 = 3.0;
+/// Half of χ²'s 95th percentile with one degree of freedom.
+const RISE: f64 = 0.5 * 3.84;
+/// Steps to each side when the end of a profile is looked for.
+const OUTWARD: usize = 40;
+/// Halvings that narrow the end down.
+const HALVINGS: usize = 7;
 
-/// An interval for each parameter of each member; for values that are searched in steps, their resolution.
-pub fn intervals(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> Vec<Vec<[f64; 2]>> {
-    let blocked = blocked(bench, fit, fit.sigma);
-    let blocks = blocked.matrices.len();
-    let size = blocked.slope.len();
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let mut draws: Vec<DVector<f64>> = Vec::with_capacity(DRAWS);
-    // Blocks drawn are fewer than blocks seen by the values fitted in them.
-    let widen = (blocks as f64 / (blocks as f64 - 1.0).max(1.0)).sqrt() * 1.06;
-    // Where the whole would step to, were it not at its optimum to the last digit, is no spread.
-    let mut matrix = DMatrix::zeros(size, size);
-    let mut right = DVector::zeros(size);
-    for (part, side) in blocked.matrices.iter().zip(&blocked.rights) {
-        matrix += part;
+/// Student's 97.5th percentile (Cornish–Fisher's expansion, three digits from three degrees of freedom on).
+pub fn student(freedom: f64) -> f64 {
+    let z = NORMAL;
+    let (z3, z5, z7) = (z.powi(3), z.powi(5), z.powi(7));
+    let v = freedom;
+    z + (z3 + z) / (4.0 * v)
+        + (5.0 * z5 + 16.0 * z3 + 3.0 * z) / (96.0 * v * v)
+        + (3.0 * z7 + 19.0 * z5 + 17.0 * z3 - 15.0 * z) / (384.0 * v * v * v)
+}
+
+/// How sure a fit's coordinates are.
+#[derive(Debug)]
+struct Certainty {
+    /// Half of the 95 % interval of each coordinate.
+    half: Vec<f64>,
+    /// By how many times the variance is that of white noise as loud as what is left, at least 1.
+    inflation: Vec<f64>,
+}
+
+/// Contiguous stretches that hold every row: the held-out blocks with their guards.
+fn stretches(bench: &Workbench<'_>) -> Vec<Range<usize>> {
+    let count = bench.blocks.len();
+    (0..count)
+        .map(|block| {
+            let start = bench.blocks[block].start;
+            let end = bench
+                .blocks
+                .get(block + 1)
+                .map_or(bench.len(), |next| next.start);
+            start..end
+        })
+        .collect()
+}
+
+/// Normal equations of a stretch.
+type Part = (DMatrix<f64>, DVector<f64>);
+
+/// Normal equations of each stretch.
+fn parts(bench: &Workbench<'_>, fit: &Fit, slope: &Slope, weights: &[f64]) -> Vec<Part> {
+    stretches(bench)
+        .into_iter()
+        .map(|rows| normal(&slope.columns, weights, &fit.residual, rows))
+        .collect()
+}
+
+/// Normal equations of the whole, with what the model file says of the base.
+fn sum(slope: &Slope, parts: &[Part]) -> Part {
+    let (mut whole, mut right) = slope.prior();
+    for (matrix, side) in parts {
+        whole += matrix;
         right += side;
     }
-    let whole = solve(&matrix, &right, 1e-9);
-    for _ in 0..DRAWS {
-        let mut matrix = DMatrix::zeros(size, size);
-        let mut right = DVector::zeros(size);
-        for _ in 0..blocks {
-            let block = (random.next_u32() as usize) % blocks.max(1);
-            matrix += &blocked.matrices[block];
-            right += &blocked.rights[block];
-        }
-        draws.push((solve(&matrix, &right, 1e-9) - &whole) * widen);
+    (whole, right)
+}
+
+/// Inverse of a normal matrix, column by column.
+fn inverse(matrix: &DMatrix<f64>) -> DMatrix<f64> {
+    let size = matrix.nrows();
+    let mut inverse = DMatrix::zeros(size, size);
+    for k in 0..size {
+        let mut unit = DVector::zeros(size);
+        unit[k] = 1.0;
+        inverse.set_column(k, &solve(matrix, &unit, 1e-12));
     }
+    inverse
+}
+
+/// How sure each coordinate of a slope is.
+fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope) -> Certainty {
+    let size = slope.len();
+    let weights = weights(&fit.residual, fit.sigma);
+    let parts = parts(bench, fit, slope, &weights);
+    let (whole, right) = sum(slope, &parts);
+    // What the whole would still step is no spread.
+    let rest = solve(&whole, &right, 1e-9);
+    let count = parts.len() as f64;
+    let mut by_stretches = vec![0.0; size];
+    let mut told = vec![(0.0, 0.0); size];
+    if parts.len() > 1 {
+        let mut steps: Vec<DVector<f64>> = Vec::with_capacity(parts.len());
+        for (matrix, side) in &parts {
+            let others = inverse(&(&whole - matrix));
+            steps.push(&others * (side - matrix * &rest));
+            let spread = &others * matrix * &others;
+            for (k, (sum, squares)) in told.iter_mut().enumerate() {
+                *sum += spread[(k, k)];
+                *squares += spread[(k, k)].powi(2);
+            }
+        }
+        let mean = steps.iter().sum::<DVector<f64>>() / count;
+        for (k, variance) in by_stretches.iter_mut().enumerate() {
+            *variance =
+                (count - 1.0) / count * steps.iter().map(|s| (s[k] - mean[k]).powi(2)).sum::<f64>();
+        }
+    }
+    // What the fit makes of each row's noise.
+    let inverted = inverse(&whole);
+    let rows = fit.residual.len().max(size + 1) as f64;
+    let limited: f64 = fit
+        .residual
+        .iter()
+        .zip(&weights)
+        .map(|(r, w)| (r * w * fit.sigma * fit.sigma).powi(2))
+        .sum();
+    let variance = limited / (rows - size as f64).max(1.0);
+    let (mut half, mut inflation) = (Vec::with_capacity(size), Vec::with_capacity(size));
+    for k in 0..size {
+        let influence: Vec<f64> = (0..fit.residual.len())
+            .map(|row| {
+                let sum: f64 = slope
+                    .columns
+                    .iter()
+                    .enumerate()
+                    .map(|(j, column)| inverted[(k, j)] * column[row])
+                    .sum();
+                sum * weights[row]
+            })
+            .collect();
+        let white = variance * influence.iter().map(|a| a * a).sum::<f64>();
+        let by_noise = bench.carried(0, &influence).unwrap_or(white);
+        let (sum, squares) = told[k];
+        let freedom = (sum * sum / squares.max(1e-300)).min(count - 1.0);
+        let mut most = NORMAL * by_noise.sqrt();
+        let mut times = by_noise / white.max(1e-300);
+        if freedom >= LEAST_FREEDOM {
+            most = most.max(student(freedom) * by_stretches[k].sqrt());
+            times = times.max(by_stretches[k] / white.max(1e-300));
+        }
+        half.push(most);
+        inflation.push(times.max(1.0));
+    }
+    Certainty { half, inflation }
+}
+
+/// How much a member's values differ from stretch to stretch.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Variation {
+    /// What values of their own for each stretch take of the loss, beyond what noise gives them, in standard deviations.
+    pub deviations: f64,
+    /// The same as energy, in the view's unit squared, summed over rows, as a share of the energy of the member's change.
+    pub share: f64,
+}
+
+/// For each member, how much its values differ from stretch to stretch (Chow's test, over all stretches at once): those of a true
+/// effect stay, those of a stand-in follow what it stands for.
+pub fn variations(bench: &Workbench<'_>, fit: &Fit) -> Vec<Variation> {
+    let slope = fit.slope(bench);
+    let weights = weights(&fit.residual, fit.sigma);
+    let stretches = stretches(bench);
+    let parts = parts(bench, fit, &slope, &weights);
+    let (whole, right) = sum(&slope, &parts);
+    let rest = solve(&whole, &right, 1e-9);
+    let freedom = fit.residual.len().saturating_sub(slope.len()).max(1) as f64;
+    let loudness = 2.0 * loss(&fit.residual, fit.sigma) / freedom;
+    let members = fit.model.members.iter().enumerate();
+    members
+        .map(|(m, member)| {
+            let own: Vec<usize> = (0..member.values.len())
+                .filter_map(|p| slope.index(m, p))
+                .collect();
+            let (mut taken, mut expected, mut variance) = (0.0, 0.0, 0.0);
+            for ((matrix, side), rows) in parts.iter().zip(&stretches) {
+                let score = side - matrix * &rest;
+                let score = DVector::from_fn(own.len(), |a, _| score[own[a]]);
+                let here = DMatrix::from_fn(own.len(), own.len(), |a, b| matrix[(own[a], own[b])]);
+                taken += score.dot(&solve(&here, &score, 1e-12));
+                let by_noise: f64 = own
+                    .iter()
+                    .filter(|&&k| matrix[(k, k)] > 0.0)
+                    .map(|&k| {
+                        let column = &slope.columns[k][rows.clone()];
+                        let weighted = column.iter().zip(&weights[rows.clone()]);
+                        let weighted: Vec<f64> = weighted.map(|(c, w)| c * w).collect();
+                        let stated = bench.carried(rows.start, &weighted).unwrap_or(0.0);
+                        loudness.max(stated / matrix[(k, k)])
+                    })
+                    .sum();
+                expected += by_noise;
+                variance += 2.0 * by_noise * by_noise / own.len() as f64;
+            }
+            let without = bench.run(&fit.model.without(m));
+            let change = change(&fit.predicted, &without);
+            let energy = dot(&change, &change).max(1e-300);
+            Variation {
+                deviations: (taken - expected) / variance.sqrt().max(1e-300),
+                share: (taken - expected).max(0.0) * fit.sigma * fit.sigma / energy,
+            }
+        })
+        .collect()
+}
+
+/// An interval for each parameter of each member.
+pub fn intervals(bench: &Workbench<'_>, fit: &Fit) -> Vec<Vec<[f64; 2]>> {
+    let slope = fit.slope(bench);
+    let certainty = certainty(bench, fit, &slope);
     fit.model
         .members
         .iter()
         .enumerate()
         .map(|(m, member)| {
-            member
-                .effect
-                .card()
-                .parameters
+            let parameters = member.effect.card().parameters;
+            parameters
                 .iter()
                 .enumerate()
                 .map(|(p, parameter)| {
                     let value = member.values[p];
-                    if parameter.search == Search::Stepped {
-                        return [
-                            profile(bench, fit, m, p, -1.0),
-                            profile(bench, fit, m, p, 1.0),
-                        ];
+                    let at = slope.index(m, p);
+                    if parameter.search == Search::Stepped || member.effect.kinked(p) {
+                        if parameter.internal || !value.is_finite() {
+                            return [value, value];
+                        }
+                        let times = at.map_or(1.0, |k| certainty.inflation[k]);
+                        let half = at.map(|k| certainty.half[k]);
+                        return [-1.0, 1.0]
+                            .map(|sign| profile(bench, fit, (m, p), parameter, sign, times, half));
                     }
-                    let mut values: Vec<f64> = draws
-                        .iter()
-                        .filter_map(|draw| {
-                            blocked.slope.value_at(m, p, &fit.model, draw.as_slice())
-                        })
-                        .collect();
-                    if values.is_empty() {
+                    let Some(k) = at else {
                         return [value, value];
-                    }
-                    values.sort_unstable_by(f64::total_cmp);
-                    let at =
-                        |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
-                    [at(0.025), at(0.975)]
+                    };
+                    [-1.0, 1.0].map(|sign| {
+                        let by = sign * certainty.half[k];
+                        if parameter.search == Search::Logarithmic {
+                            value * by.exp()
+                        } else {
+                            value + by
+                        }
+                    })
                 })
                 .collect()
         })
         .collect()
 }
 
-/// How far a value can go to one side before the loss has risen by what bounds a 95 % interval (profile likelihood, χ² with one
-/// degree of freedom), the others staying.
-fn profile(bench: &Workbench<'_>, fit: &Fit, member: usize, parameter: usize, sign: f64) -> f64 {
-    const RISE: f64 = 0.5 * 3.84;
+/// How far a value can go to one side before the loss, everything else fitted again, has risen by what bounds a 95 % interval.
+fn profile(
+    bench: &Workbench<'_>,
+    fit: &Fit,
+    (member, parameter): (usize, usize),
+    card: &Parameter,
+    sign: f64,
+    inflation: f64,
+    half: Option<f64>,
+) -> f64 {
     let value = fit.model.members[member].values[parameter];
-    let loss = |residual: &[f64]| loss(residual, fit.sigma);
-    let here = loss(&fit.residual);
-    let mut share = 1e-6;
-    let mut last = value;
-    while share < 0.5 {
-        let there = value * (1.0 + sign * share);
+    let (low, high) = fit.model.members[member]
+        .effect
+        .bounds(parameter, &bench.scale);
+    // What is left may be louder or quieter than the spread that the loss is told in.
+    let here = loss(&fit.residual, fit.sigma);
+    let loudness = 2.0 * here / fit.residual.len().max(1) as f64;
+    let limit = here + RISE * inflation * loudness.max(0.1);
+    let risen = |there: f64| {
         let mut model = fit.model.clone();
         model.members[member].values[parameter] = there;
-        if loss(&bench.residual(&bench.run(&model))) > here + RISE {
-            return there;
+        let others_free = model.members.iter().any(|m| m.values.len() > 1)
+            || model.members.len() > 1
+            || bench.aligns(&model);
+        let fixed = loss(&bench.residual(&bench.run(&model)), fit.sigma);
+        if fixed <= limit || !others_free {
+            return fixed > limit;
         }
-        last = there;
-        share *= 1.6;
+        let model = Model {
+            held: Some((member, parameter)),
+            ..model
+        };
+        loss(&refit(bench, &model, None).residual, fit.sigma) > limit
+    };
+    let size = match card.search {
+        Search::Linear | Search::Smooth => (high - low).abs().min(1e6 * value.abs().max(1e-6)),
+        _ => value.abs(),
+    };
+    let mut step = half
+        .filter(|half| half.is_finite() && *half > 0.0)
+        .map_or(1e-6 * size, |half| {
+            if card.search == Search::Logarithmic {
+                0.1 * half * value
+            } else {
+                0.1 * half
+            }
+        })
+        .max(1e-7 * size);
+    let (mut inside, mut outside) = (value, None);
+    for _ in 0..OUTWARD {
+        let there = (inside + sign * step).clamp(low.min(high), high.max(low));
+        if there == inside {
+            return inside;
+        }
+        if risen(there) {
+            outside = Some(there);
+            break;
+        }
+        inside = there;
+        step *= 2.0;
     }
-    last
+    let Some(mut outside) = outside else {
+        return inside;
+    };
+    for _ in 0..HALVINGS {
+        let middle = 0.5 * (inside + outside);
+        if risen(middle) {
+            outside = middle;
+        } else {
+            inside = middle;
+        }
+    }
+    outside
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn students_percentiles_are_those_of_the_tables() {
+        for (freedom, table) in [(3.0, 3.182), (5.0, 2.571), (10.0, 2.228), (23.0, 2.069)] {
+            let found = student(freedom);
+            assert!((found / table - 1.0).abs() < 0.01, "{freedom}: {found}");
+        }
+    }
 }

@@ -26,7 +26,7 @@ const FLOOR: f64 = 0.04;
 const PLACE: f64 = 0.12;
 /// Standard deviations of the stated noise that an effect has to be away from nothing: one in a thousand recordings has an effect
 /// of some thirty by chance that is 4.2 away.
-const CERTAIN: f64 = 4.2;
+pub const CERTAIN: f64 = 4.2;
 /// Rows where an effect changes the reading by at least this share of its largest change are where it acts.
 const ACTS: f64 = 0.2;
 /// Share of the held-out error from which on a single effect is clear by itself.
@@ -41,6 +41,8 @@ const SMALL: f64 = 0.2;
 const STRETCHES: usize = 200;
 /// A model is beaten if another's held-out loss is lower by this many standard errors of their paired difference.
 const BEATEN: f64 = 2.0;
+/// An effect would do as well as another if it takes at least this share of what that one takes.
+const EQUAL: f64 = 0.5;
 
 /// A named effect and what speaks for it.
 #[derive(Clone, Debug)]
@@ -393,6 +395,18 @@ fn obstacle(
     index: usize,
     gain: f64,
 ) -> Option<String> {
+    hindrance(bench, before, after, index, gain, false)
+}
+
+/// The same; an equal of another effect may be what that one is by a value beyond what the recording tells.
+fn hindrance(
+    bench: &Workbench<'_>,
+    before: &Fit,
+    after: &Fit,
+    index: usize,
+    gain: f64,
+    equal: bool,
+) -> Option<String> {
     let member = &after.model.members[index];
     let card = member.effect.card();
     let without = bench.run(&after.model.without(index));
@@ -461,6 +475,13 @@ fn obstacle(
     {
         let (low, high) = member.effect.bounds(p, &bench.scale);
         let value = member.values[p];
+        let endless = member.effect.endless(p, &bench.scale);
+        if value >= endless && !equal {
+            return Some(format!(
+                "{} would be {value:.4}, more than the recording tells",
+                parameter.name
+            ));
+        }
         let margin = match parameter.search {
             Search::Logarithmic => value * 0.01,
             _ => 1e-4 * (high - low),
@@ -475,6 +496,8 @@ fn obstacle(
         if let Some(end) = end
             && end != 0.0
             && !parameter.open
+            && value < endless
+            && !(parameter.from_bottom && end == low)
         {
             return Some(format!(
                 "{} would be at the end of what is physics, {end:.4}",
@@ -793,13 +816,17 @@ fn name(
         .map(|index| {
             let id = now.model.members[index].id();
             let without = fit(bench, &now.model.without(index), None);
+            let taken = share(bench, &without, now);
+            // Where few rows decide, the difference of two models is never certain: who takes much less is no equal.
+            let least = (EQUAL * taken).max(p99_of(step_p99, id));
             let mut equivalent: Vec<&'static str> = others
                 .iter()
                 .filter(|(at, _)| *at == index)
                 .filter(|(_, other)| {
                     let last = other.model.members.len() - 1;
-                    !beaten(bench, other, now)
-                        && obstacle(bench, &without, other, last, 1.0).is_none()
+                    share(bench, &without, other) >= least
+                        && !beaten(bench, other, now)
+                        && hindrance(bench, &without, other, last, 1.0, true).is_none()
                 })
                 .filter_map(|(_, other)| other.model.members.last().map(Member::id))
                 .collect();
@@ -807,7 +834,7 @@ fn name(
             equivalent.dedup();
             Named {
                 index,
-                held_out_gain: share(bench, &without, now),
+                held_out_gain: taken,
                 placebo_p99: p99_of(step_p99, id),
                 equivalent,
             }
@@ -830,7 +857,10 @@ fn beaten(bench: &Workbench<'_>, other: &Fit, chosen: &Fit) -> bool {
     let mean = differences.iter().sum::<f64>() / count;
     let variance =
         differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
-    mean > BEATEN * (variance / count).sqrt()
+    // Noise with a memory tells two models apart by no more than what it does along their difference, however many the rows.
+    let apart = change(&other.predicted, &chosen.predicted);
+    let stated = bench.carried(0, &apart).unwrap_or(0.0).sqrt() / (sigma * sigma * count);
+    mean > BEATEN * (variance / count).sqrt().max(stated)
 }
 
 /// Whether a model owes what it gains to the alignment of samples that its effect sets free, and not to the effect.

@@ -10,7 +10,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 
 use crate::effects::chain::{Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
-use crate::effects::{Clues, Effect, LIBRARY, Stage};
+use crate::effects::{Clues, Effect, LIBRARY, Parameter, Stage};
 use crate::problem::{Base, Problem, View};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row).
@@ -53,6 +53,8 @@ pub struct Model {
     pub nuisance: Nuisance,
     /// Samples stand at their rows, though an effect works between them.
     pub unaligned: bool,
+    /// A value that fits leave as it is: its member and its place there.
+    pub held: Option<(usize, usize)>,
 }
 
 impl Model {
@@ -108,7 +110,12 @@ pub struct Workbench<'a> {
 }
 
 /// A model to the last digit.
-type Key = (Vec<(&'static str, Vec<u64>)>, [u64; 3], bool);
+type Key = (
+    Vec<(&'static str, Vec<u64>)>,
+    [u64; 3],
+    bool,
+    Option<(usize, usize)>,
+);
 
 fn key(model: &Model) -> Key {
     let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect();
@@ -126,6 +133,7 @@ fn key(model: &Model) -> Key {
         ]
         .map(f64::to_bits),
         model.unaligned,
+        model.held,
     )
 }
 
@@ -151,12 +159,14 @@ impl<'a> Workbench<'a> {
         };
         let scale = scale(problem, &t_s, &y, &plain);
         let blocks = blocks(&rows);
+        let quasi_static = matches!(&problem.base, Base::Sensor(base) if base.quasi_static);
         let library = LIBRARY
             .iter()
             .copied()
             .filter(|effect| {
                 let id = effect.card().id;
                 effect.applies(problem)
+                    && !(quasi_static && effect.card().parameters.iter().any(Parameter::timed))
                     && !without.iter().any(|name| name == id)
                     && !problem.modelled.iter().any(|(known, _)| *known == id)
             })
@@ -223,25 +233,39 @@ impl<'a> Workbench<'a> {
             .sum()
     }
 
-    /// How many standard deviations a fitted change is away from what the stated coloured noise does by itself: its projection
-    /// on the change has the variance `cᵀΣc`, with Σ of an exponential memory and white noise. Infinite if none is stated.
-    pub fn deviations(&self, change: &[f64]) -> f64 {
+    /// Variance of a weighted sum of readings from a row on, `aᵀΣa`, under the noise that the model file states, with Σ of an
+    /// exponential memory and white noise; `None` if it states none with a memory.
+    pub fn carried(&self, from: usize, weights: &[f64]) -> Option<f64> {
         let coloured = self.problem.coloured;
         if !(coloured.rms > 0.0 && coloured.tau_s > 0.0) {
-            return f64::INFINITY;
+            return None;
         }
         let (mut energy, mut together, mut memory) = (0.0, 0.0, 0.0);
         let mut last: Option<(f64, f64)> = None;
-        for (t, c) in self.t_s.iter().zip(change) {
+        for (t, a) in self.t_s[from..].iter().zip(weights) {
             if let Some((before, previous)) = last {
                 memory = (memory + previous) * (-(t - before).max(0.0) / coloured.tau_s).exp();
             }
-            energy += c * c;
-            together += c * memory;
-            last = Some((*t, *c));
+            energy += a * a;
+            together += a * memory;
+            last = Some((*t, *a));
         }
-        let variance = self.problem.noise.powi(2) * energy + 2.0 * coloured.rms.powi(2) * together;
-        energy / variance.max(1e-300).sqrt()
+        Some(self.problem.noise.powi(2) * energy + 2.0 * coloured.rms.powi(2) * together)
+    }
+
+    /// How many standard deviations a fitted change is away from what the stated coloured noise does by itself: its projection
+    /// on the change has the variance `cᵀΣc`. Infinite if none is stated.
+    pub fn deviations(&self, change: &[f64]) -> f64 {
+        let energy: f64 = change.iter().map(|c| c * c).sum();
+        match self.carried(0, change) {
+            Some(variance) => energy / variance.max(1e-300).sqrt(),
+            None => f64::INFINITY,
+        }
+    }
+
+    /// Whether time means nothing in this recording.
+    pub fn quasi_static(&self) -> bool {
+        matches!(&self.problem.base, Base::Sensor(base) if base.quasi_static)
     }
 
     /// The simulation at the rows that count.
@@ -291,7 +315,9 @@ impl<'a> Workbench<'a> {
     pub fn aligns(&self, model: &Model) -> bool {
         matches!(self.problem.base, Base::Sensor(_))
             && !model.unaligned
+            // These have a time of their own.
             && !model.has("delay")
+            && !model.has("sampled-window")
             && model.members.iter().any(|member| {
                 matches!(member.effect.card().stage, Stage::Filter | Stage::Converter)
             })
@@ -373,6 +399,12 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         mismatch: rms(y.iter().zip(plain).map(|(y, p)| y - p)),
         step_s: drive.median_step_s(),
         reading_step_s,
+        even_s: match t_s {
+            [first, .., last] if reading_step_s > 0.0 => {
+                (last - first) / ((last - first) / reading_step_s).round().max(1.0)
+            }
+            _ => reading_step_s,
+        },
         fastest_s: 0.02 * drive.median_step_s().min(reading_step_s),
         span_s,
         ..Scale::default()
