@@ -227,6 +227,12 @@ pub trait Effect: Sync {
         None
     }
 
+    /// Number of independent values among which the best is chosen without any of them being near another (periods, each a line
+    /// of its own in noise): 1 for a value that is followed from a start.
+    fn choices(&self, _scale: &Scale) -> f64 {
+        1.0
+    }
+
     /// What the readings show by themselves, whatever the simulation says.
     fn mark(&self, _scale: &Scale, _clues: &Clues<'_>) -> Option<Mark> {
         None

@@ -21,6 +21,8 @@ const SLOW: f64 = 5e-3;
 const ENOUGH: f64 = 1e-4;
 /// How far away values without a slope are tried.
 const SHARES: [f64; 8] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5];
+/// The same for values that are moved together.
+const TOGETHER: [f64; 7] = [0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4];
 
 /// A fit of more rows than this does not keep its slope: memory stays linear in the recording, with a small factor.
 const KEPT_ROWS: usize = 40_000;
@@ -651,8 +653,8 @@ fn search_steps(
     for m in 0..model.members.len() {
         let effect = model.members[m].effect;
         // Where values depend on one another they are moved together.
-        for share in SHARES {
-            for _ in 0..4 {
+        for share in TOGETHER {
+            for _ in 0..10 {
                 let Some(near) = effect.near(&model.members[m].values, &bench.scale, share) else {
                     break;
                 };
@@ -663,6 +665,11 @@ fn search_steps(
                         *value = value.clamp(low, high);
                     }
                     let mut moved = model.clone();
+                    if let Some((held, p)) = model.held
+                        && held == m
+                    {
+                        values[p] = model.members[m].values[p];
+                    }
                     moved.members[m].values = values;
                     let there_predicted = bench.run(&moved);
                     let there_residual = bench.residual(&there_predicted);

@@ -41,6 +41,8 @@ const SMALL: f64 = 0.2;
 const STRETCHES: usize = 200;
 /// A model is beaten if another's held-out loss is lower by this many standard errors of their paired difference.
 const BEATEN: f64 = 2.0;
+/// The best of many choices counts from where noise would reach once in so many recordings.
+const CHANCE: f64 = 1e-3;
 /// An effect would do as well as another if it takes at least this share of what that one takes.
 const EQUAL: f64 = 0.5;
 
@@ -100,7 +102,18 @@ impl Selection {
 
 /// Held-out loss of a fit by row, and in all.
 fn losses(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> (Vec<f64>, f64) {
-    let rows = held_out(bench, fit, sigma).concat();
+    let mut rows = held_out(bench, fit, sigma).concat();
+    // The best of many independent choices fits noise by the logarithm of their number, and no block held out shows it.
+    let chance: f64 = fit
+        .model
+        .members
+        .iter()
+        .map(|member| member.effect.choices(&bench.scale))
+        .filter(|choices| *choices > 1.0)
+        .map(|choices| (choices / CHANCE).ln())
+        .sum();
+    let each = chance / rows.len().max(1) as f64;
+    rows.iter_mut().for_each(|loss| *loss += each);
     let all = rows.iter().sum();
     (rows, all)
 }
@@ -298,16 +311,24 @@ fn fits(
     most: usize,
     starts: usize,
 ) -> Vec<(Fit, f64)> {
-    let mut chosen: Vec<&Entry> = Vec::new();
-    let mut effects: Vec<(&'static str, usize, usize)> = Vec::new();
+    let mut effects: Vec<Vec<&Entry>> = Vec::new();
     for entry in entries {
-        let key = (entry.member.id(), entry.member.values.len());
-        match effects.iter().position(|(id, size, _)| (*id, *size) == key) {
-            Some(at) if effects[at].2 < starts => effects[at].2 += 1,
-            None if effects.len() < most => effects.push((key.0, key.1, 1)),
-            _ => continue,
+        let key = |entry: &Entry| (entry.member.id(), entry.member.values.len());
+        let known = effects.iter().position(|of| key(of[0]) == key(entry));
+        match known {
+            Some(at) => effects[at].push(entry),
+            None if effects.len() < most => effects.push(vec![entry]),
+            None => (),
         }
-        chosen.push(entry);
+    }
+    let mut chosen: Vec<&Entry> = Vec::new();
+    for mut of in effects {
+        // Where the size is not free, nothing but the start itself says how good it is.
+        if of[0].fixed() {
+            of.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+        }
+        of.truncate(starts);
+        chosen.extend(of);
     }
     chosen
         .into_par_iter()
@@ -484,6 +505,7 @@ fn hindrance(
         }
         let margin = match parameter.search {
             Search::Logarithmic => value * 0.01,
+            Search::Stepped if low > 0.0 => value * 0.01,
             _ => 1e-4 * (high - low),
         };
         let end = if value <= low + margin {
