@@ -37,6 +37,8 @@ pub struct Scale {
     pub capacity_ah: f64,
     /// Ohmic resistance by design in Ω.
     pub resistance_ohm: f64,
+    /// Cells in series, 0 without a battery.
+    pub cells: f64,
     /// Averaging window by design in s.
     pub window_s: f64,
     /// The converter's step by design.
@@ -668,7 +670,7 @@ pub fn arrhenius(b_k: f64, temperature_c: f64) -> f64 {
 }
 
 /// Straight lines between the points of the table and beyond its ends.
-fn open_circuit_v(table: &[(f64, f64)], soc: &[f64]) -> Vec<f64> {
+pub fn open_circuit_v(table: &[(f64, f64)], soc: &[f64]) -> Vec<f64> {
     match table {
         [] => vec![0.0; soc.len()],
         [only] => vec![only.1; soc.len()],

@@ -4,6 +4,7 @@
 use nalgebra::{DMatrix, DVector};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
+use rand_distr::{Distribution as _, StandardNormal};
 
 use super::fit::{Fit, blocked, loss, solve};
 use super::workbench::Workbench;
@@ -28,6 +29,7 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> Vec<Vec<[f64; 2
         matrix += part;
         right += side;
     }
+    blocked.slope.belief(&mut matrix, &mut right, || 0.0);
     let whole = solve(&matrix, &right, 1e-9);
     for _ in 0..DRAWS {
         let mut matrix = DMatrix::zeros(size, size);
@@ -37,6 +39,10 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> Vec<Vec<[f64; 2
             matrix += &blocked.matrices[block];
             right += &blocked.rights[block];
         }
+        // What the model file says of the base is as uncertain as it says.
+        blocked.slope.belief(&mut matrix, &mut right, || {
+            StandardNormal.sample(&mut random)
+        });
         draws.push((solve(&matrix, &right, 1e-9) - &whole) * widen);
     }
     fit.model
