@@ -31,7 +31,8 @@ impl Effect for ResistanceTemperature {
 
     fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {
         // A conductor that is a part of it rises with temperature by 0.4 %/K, that is −350 K.
-        (-500.0, 20_000.0)
+        // The most: 80 kJ/mol; charge transfer of lithium-ion cells has 50 … 70.
+        (-500.0, 10_000.0)
     }
 
     fn starts(&self, _scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {

@@ -422,7 +422,11 @@ fn obstacle(
         ));
     }
     let beside = beside(bench, after, index);
-    let all: f64 = change.iter().map(|c| c * c).sum();
+    let mut all: f64 = change.iter().map(|c| c * c).sum();
+    if before.model.members.len() < after.model.members.len() {
+        // What the others would do in its place is theirs.
+        all = all.min(apart(before, after));
+    }
     if all < beside {
         return Some(format!(
             "{:.2} rms, which the equations of the others may be off by ({:.2})",
@@ -485,10 +489,18 @@ fn obstacle(
     None
 }
 
-/// Energy by which the other effects' equations may be off.
+/// Energy by which two models' simulations are apart.
+fn apart(one: &Fit, other: &Fit) -> f64 {
+    change(&one.predicted, &other.predicted)
+        .iter()
+        .map(|change| change * change)
+        .sum()
+}
+
+/// Energy by which the other effects' equations may be off, those of the model file among them.
 fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
     let members = &fit.model.members;
-    (0..members.len())
+    let others: f64 = (0..members.len())
         .filter(|other| *other != index)
         .map(|other| {
             let share = members[other].effect.idealised();
@@ -505,7 +517,8 @@ fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
                 .sum();
             share * share * energy
         })
-        .sum()
+        .sum();
+    bench.modelled + others
 }
 
 /// Two effects that hide each other: neither passes alone, both together do.
@@ -793,12 +806,14 @@ fn name(
         .map(|index| {
             let id = now.model.members[index].id();
             let without = fit(bench, &now.model.without(index), None);
+            let beside = beside(bench, now, index);
             let mut equivalent: Vec<&'static str> = others
                 .iter()
                 .filter(|(at, _)| *at == index)
                 .filter(|(_, other)| {
                     let last = other.model.members.len() - 1;
-                    !beaten(bench, other, now)
+                    // What the other effects' equations may be off by does not decide between two.
+                    (apart(now, other) < beside || !beaten(bench, other, now))
                         && obstacle(bench, &without, other, last, 1.0).is_none()
                 })
                 .filter_map(|(_, other)| other.model.members.last().map(Member::id))
