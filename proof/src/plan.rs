@@ -53,6 +53,8 @@ const NOISES: [&str; 3] = ["white", "coloured", "quantised"];
 const DRIVES: [&str; 3] = ["us06", "hwfet", "gpu"];
 /// Drives of the battery's makers.
 const CELL_DRIVES: [&str; 2] = ["us06", "hwfet"];
+/// A third one: pulses between rests.
+const PULSES: &str = "hppc";
 /// Rows of a case of the sensing chain: a little less than seven minutes at 10 Hz.
 const ROWS: usize = 4000;
 /// Rows of a circuit: five minutes.
@@ -339,13 +341,13 @@ fn others() -> Vec<Planned> {
 
 /// Cells by PyBaMM.
 fn cells() -> Vec<Planned> {
-    let cell = |effects: &[&str], strength, drive, more: Value| {
+    let noisy = |effects: &[&str], strength, noise, drive, more: Value| {
         New {
             group: Group::Cells,
             maker: "cells",
             effects,
             strength,
-            noise: "white",
+            noise,
             drive,
             seed: 1,
             rows: if more.get("model") == Some(&json!("dfn")) {
@@ -356,6 +358,9 @@ fn cells() -> Vec<Planned> {
             options: options(more),
         }
         .planned()
+    };
+    let cell = |effects: &[&str], strength, drive, more: Value| {
+        noisy(effects, strength, "white", drive, more)
     };
     let mut plan = Vec::new();
     // What such a cell has by nature, beside open-circuit voltage and one resistance.
@@ -393,6 +398,22 @@ fn cells() -> Vec<Planned> {
     ] {
         for (strength, drive) in [(10.0, "hwfet"), (30.0, "hwfet"), (30.0, "us06")] {
             plan.push(cell(&[effect], strength, drive, Value::Null));
+        }
+        for noise in ["coloured", "quantised"] {
+            plan.push(noisy(&[effect], 30.0, noise, "us06", Value::Null));
+        }
+    }
+    for (noise, drive) in [
+        ("coloured", "us06"),
+        ("quantised", "us06"),
+        ("white", PULSES),
+        ("coloured", PULSES),
+    ] {
+        let spme = || json!({ "model": "spme" });
+        plan.push(noisy(&["diffusion"], 10.0, noise, drive, spme()));
+        // The circuit was fitted to driving: pulses show more than it leaves there.
+        if drive != PULSES {
+            plan.push(noisy(&[], f64::INFINITY, noise, drive, spme()));
         }
     }
     // Only what such a circuit leaves.
@@ -452,7 +473,7 @@ fn single_battery() -> Vec<Planned> {
     for effect in BATTERY {
         for strength in STRENGTHS {
             for noise in NOISES {
-                for (place, drive) in CELL_DRIVES.into_iter().enumerate() {
+                for (place, drive) in CELL_DRIVES.into_iter().chain([PULSES]).enumerate() {
                     if place == 0 || noise == "white" {
                         plan.push(single(
                             "battery",
@@ -748,8 +769,25 @@ fn is_quick(planned: &Planned) -> bool {
     }
 }
 
-/// The cases of a campaign.
-pub fn plan(extent: Extent, real: &[Expected]) -> Vec<Planned> {
+/// Added to the seeds below: with those themselves the tool was made, and what it is judged on was not looked at before.
+pub const SEEDS: u64 = 10;
+
+/// The cases of a campaign. Other `seeds` make other data of the same kinds; real recordings and the board have none.
+pub fn plan(extent: Extent, real: &[Expected], seeds: u64) -> Vec<Planned> {
+    let mut plan = cases(extent, real);
+    for planned in &mut plan {
+        let case = &mut planned.case;
+        if !case.maker.is_empty() {
+            let [old, new] =
+                [case.seed, case.seed + seeds].map(|seed| format!("_{}_{seed}", case.drive));
+            case.id = case.id.replacen(&old, &new, 1);
+            case.seed += seeds;
+        }
+    }
+    plan
+}
+
+fn cases(extent: Extent, real: &[Expected]) -> Vec<Planned> {
     let mut plan = full(real);
     if extent == Extent::Quick {
         plan.retain(is_quick);
@@ -788,7 +826,7 @@ mod tests {
 
     #[test]
     fn ids_are_unique_and_names_of_folders() {
-        let plan = plan(Extent::Full, &real());
+        let plan = plan(Extent::Full, &real(), SEEDS);
         let ids: HashSet<&str> = plan.iter().map(|one| one.case.id.as_str()).collect();
         assert_eq!(ids.len(), plan.len());
         for id in ids {
@@ -801,8 +839,20 @@ mod tests {
     }
 
     #[test]
+    fn other_seeds_are_other_cases_of_the_same_kinds() {
+        let [some, others] = [0, SEEDS].map(|seeds| plan(Extent::Full, &real(), seeds));
+        assert_eq!(some.len(), others.len());
+        for (one, other) in some.iter().zip(&others) {
+            assert_eq!(one.case.effects, other.case.effects);
+            let made = !one.case.maker.is_empty();
+            assert_eq!(made, one.case.id != other.case.id, "{}", one.case.id);
+            assert_eq!(made, one.case.seed != other.case.seed, "{}", one.case.id);
+        }
+    }
+
+    #[test]
     fn every_effect_meets_every_strength_noise_and_drive() {
-        let plan = plan(Extent::Full, &real());
+        let plan = plan(Extent::Full, &real(), SEEDS);
         let there = |effect: &str, strength: f64, noise: &str, drive: &str| {
             plan.iter().any(|one| {
                 let case = &one.case;
@@ -829,11 +879,11 @@ mod tests {
 
     #[test]
     fn the_quick_campaign_is_a_small_part_of_the_full_one() {
-        let full: HashSet<String> = plan(Extent::Full, &real())
+        let full: HashSet<String> = plan(Extent::Full, &real(), SEEDS)
             .into_iter()
             .map(|one| one.case.id)
             .collect();
-        let quick = plan(Extent::Quick, &real());
+        let quick = plan(Extent::Quick, &real(), SEEDS);
         assert!((30..=80).contains(&quick.len()), "{}", quick.len());
         assert!(quick.iter().all(|one| full.contains(&one.case.id)));
         for group in [Group::Real, Group::Single, Group::Clean, Group::Outside] {
