@@ -5,7 +5,7 @@ use super::{Card, Clues, Effect, IDEALISED, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
 /// Terms of the series that are calculated.
-const TERMS: usize = 8;
+const TERMS: usize = 9;
 /// State of charge between which the mean slope of the open-circuit voltage is taken: the ends of the curve are steep.
 const MIDDLE: (f64, f64) = (0.2, 0.8);
 /// Share by which the straight law may be off: the slope of the open-circuit voltage, which makes concentration into voltage, changes
@@ -87,21 +87,13 @@ impl Effect for Diffusion {
             .zip(&battery.factor)
             .map(|(i, factor)| i * factor)
             .collect();
-        // Poles at ((k − ½)·π)².
-        let poles: [f64; TERMS] =
-            std::array::from_fn(|k| ((k as f64 + 0.5) * std::f64::consts::PI).powi(2));
-        let weights = poles.map(|pole| ohms * 2.0 / pole);
-        // What the terms leave out acts at once.
-        let left = ohms - weights.iter().sum::<f64>();
+        let (weights, taus) = series();
         let mut drop = steps.ladder(
             &drive.segments,
             &driven,
-            poles.map(|pole| tau / pole),
-            weights,
+            taus.map(|share| share * tau),
+            weights.map(|share| share * ohms),
         );
-        drop.iter_mut()
-            .zip(&driven)
-            .for_each(|(drop, i)| *drop += left * i);
         let share = values.get(2).copied().unwrap_or_default();
         if share != 0.0
             && let Some(slope_v) = middle_slope_v(&battery.base.ocv)
@@ -133,6 +125,20 @@ impl Effect for Diffusion {
             IDEALISED
         }
     }
+}
+
+/// Weights and time constants, as shares of R and τ: poles at ((k − ½)·π)², and one more for what those leave out, with its weight
+/// and its mean time constant (all weights make 1, and with their time constants ⅓: tanh(x)/x = 1 − x²/3).
+fn series() -> ([f64; TERMS], [f64; TERMS]) {
+    let poles: [f64; TERMS] =
+        std::array::from_fn(|k| ((k as f64 + 0.5) * std::f64::consts::PI).powi(2));
+    let (mut weights, mut taus) = (poles.map(|pole| 2.0 / pole), poles.map(f64::recip));
+    let last = TERMS - 1;
+    let known = weights[..last].iter().sum::<f64>();
+    let moment: f64 = weights[..last].iter().zip(&taus).map(|(w, tau)| w * tau).sum();
+    weights[last] = 1.0 - known;
+    taus[last] = (1.0 / 3.0 - moment) / weights[last];
+    (weights, taus)
 }
 
 /// Mean slope of the open-circuit voltage over the middle of the states of charge, in V; none where it does not rise.

@@ -1,7 +1,7 @@
 //! RC branches after the ohmic step.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+use super::{Card, Clues, Effect, IDEALISED, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
 /// One to three branches: one id, and as many parameters as branches need.
@@ -74,6 +74,11 @@ impl Effect for Polarisation {
                 .map(|(a, b, c)| vec![r, taus[a], r, taus[b], r, taus[c]])
                 .to_vec(),
         }
+    }
+
+    /// Branches stand for a distributed process, whose resistance changes over a drive by some ten percent either way.
+    fn idealised(&self) -> f64 {
+        2.0 * IDEALISED
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

@@ -39,6 +39,11 @@ impl Effect for ResistanceTemperature {
         vec![vec![300.0], vec![2000.0], vec![5000.0]]
     }
 
+    /// Over the tens of kelvin of a recording the law holds within a percent.
+    fn idealised(&self) -> f64 {
+        0.01
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         if let Some(battery) = &mut scene.battery {
             battery.arrhenius_k = Some(values[0]);
