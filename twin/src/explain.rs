@@ -378,7 +378,9 @@ fn stand_in(
         .filter(|fit| {
             let last = fit.model.members.len() - 1;
             let intervals = intervals::intervals(bench, fit, seed);
-            untold(&bench.scale, &fit.model.members[last], &intervals[last]).is_none()
+            let member = &fit.model.members[last];
+            select::at_end(bench, member).is_none()
+                && untold(&bench.scale, member, &intervals[last]).is_none()
         })
         .min_by(|a, b| a.cost.total_cmp(&b.cost))
         .map(|fit| fit::polish(bench, &fit))

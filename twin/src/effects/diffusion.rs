@@ -25,7 +25,7 @@ pub static THROUGH_OCV: Diffusion = Diffusion { card: &CARDS[1] };
 
 static PARAMETERS: [Parameter; 3] = [
     Parameter::new("r_ohm", "Ω", 0.0, Search::Linear),
-    Parameter::new("tau_s", "s", 100.0, Search::Logarithmic),
+    Parameter::new("tau_s", "s", 100.0, Search::Logarithmic).open(),
     Parameter::new("ocv_share", "1", 0.0, Search::Smooth).open(),
 ];
 

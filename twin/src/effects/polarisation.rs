@@ -19,11 +19,11 @@ pub static THREE_BRANCHES: Polarisation = Polarisation { card: &CARDS[2] };
 
 static PARAMETERS: [Parameter; 6] = [
     Parameter::new("r1_ohm", "Ω", 0.0, Search::Linear),
-    Parameter::new("tau1_s", "s", 1.0, Search::Logarithmic),
+    Parameter::new("tau1_s", "s", 1.0, Search::Logarithmic).open(),
     Parameter::new("r2_ohm", "Ω", 0.0, Search::Linear),
-    Parameter::new("tau2_s", "s", 10.0, Search::Logarithmic),
+    Parameter::new("tau2_s", "s", 10.0, Search::Logarithmic).open(),
     Parameter::new("r3_ohm", "Ω", 0.0, Search::Linear),
-    Parameter::new("tau3_s", "s", 100.0, Search::Logarithmic),
+    Parameter::new("tau3_s", "s", 100.0, Search::Logarithmic).open(),
 ];
 
 static CARDS: [Card; 3] = [

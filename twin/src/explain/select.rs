@@ -393,6 +393,18 @@ fn obstacle(
     index: usize,
     gain: f64,
 ) -> Option<String> {
+    small(bench, before, after, index, gain)
+        .or_else(|| at_end(bench, &after.model.members[index]))
+}
+
+/// The first two of these.
+fn small(
+    bench: &Workbench<'_>,
+    before: &Fit,
+    after: &Fit,
+    index: usize,
+    gain: f64,
+) -> Option<String> {
     let member = &after.model.members[index];
     let card = member.effect.card();
     let without = bench.run(&after.model.without(index));
@@ -457,6 +469,12 @@ fn obstacle(
             f64::sqrt(accuracy / rows)
         ));
     }
+    None
+}
+
+/// What of an effect's values would be at the end of what is physics.
+pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
+    let card = member.effect.card();
     for (p, parameter) in card
         .parameters
         .iter()
@@ -787,7 +805,9 @@ fn plainer(
                 .map(|(_, fit)| fit)
                 .filter(|fit| {
                     fit.model.members.last().is_some_and(|member| {
-                        exact(member) && one.equivalent.contains(&member.id())
+                        exact(member)
+                            && one.equivalent.contains(&member.id())
+                            && at_end(bench, member).is_none()
                     }) && !beaten(bench, fit, now)
                 })
                 .min_by(|a, b| a.cost.total_cmp(&b.cost))
@@ -814,7 +834,8 @@ fn name(
                     let last = other.model.members.len() - 1;
                     // What the other effects' equations may be off by does not decide between two.
                     (apart(now, other) < beside || !beaten(bench, other, now))
-                        && obstacle(bench, &without, other, last, 1.0).is_none()
+                        // At the end of what is physics it cannot be named, and speaks against another's being certain.
+                        && small(bench, &without, other, last, 1.0).is_none()
                 })
                 .filter_map(|(_, other)| other.model.members.last().map(Member::id))
                 .collect();
