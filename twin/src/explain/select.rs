@@ -416,17 +416,16 @@ fn obstacle(
     index: usize,
     gain: f64,
 ) -> Option<String> {
-    hindrance(bench, before, after, index, gain, false)
+    small(bench, before, after, index, gain).or_else(|| at_end(bench, &after.model.members[index]))
 }
 
-/// The same; an equal of another effect may be what that one is by a value beyond what the recording tells.
-fn hindrance(
+/// The first two of these.
+fn small(
     bench: &Workbench<'_>,
     before: &Fit,
     after: &Fit,
     index: usize,
     gain: f64,
-    equal: bool,
 ) -> Option<String> {
     let member = &after.model.members[index];
     let card = member.effect.card();
@@ -457,7 +456,11 @@ fn hindrance(
         ));
     }
     let beside = beside(bench, after, index);
-    let all: f64 = change.iter().map(|c| c * c).sum();
+    let mut all: f64 = change.iter().map(|c| c * c).sum();
+    if before.model.members.len() < after.model.members.len() {
+        // What the others would do in its place is theirs.
+        all = all.min(apart(before, after));
+    }
     if all < beside {
         return Some(format!(
             "{:.2} rms, which the equations of the others may be off by ({:.2})",
@@ -488,6 +491,12 @@ fn hindrance(
             f64::sqrt(accuracy / rows)
         ));
     }
+    None
+}
+
+/// What of an effect's values would be at the end of what is physics.
+pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
+    let card = member.effect.card();
     for (p, parameter) in card
         .parameters
         .iter()
@@ -497,7 +506,7 @@ fn hindrance(
         let (low, high) = member.effect.bounds(p, &bench.scale);
         let value = member.values[p];
         let endless = member.effect.endless(p, &bench.scale);
-        if value >= endless && !equal {
+        if value >= endless {
             return Some(format!(
                 "{} would be {value:.4}, more than the recording tells",
                 parameter.name
@@ -530,10 +539,18 @@ fn hindrance(
     None
 }
 
-/// Energy by which the other effects' equations may be off.
+/// Energy by which two models' simulations are apart.
+fn apart(one: &Fit, other: &Fit) -> f64 {
+    change(&one.predicted, &other.predicted)
+        .iter()
+        .map(|change| change * change)
+        .sum()
+}
+
+/// Energy by which the other effects' equations may be off, those of the model file among them.
 fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
     let members = &fit.model.members;
-    (0..members.len())
+    let others: f64 = (0..members.len())
         .filter(|other| *other != index)
         .map(|other| {
             let share = members[other].effect.idealised();
@@ -550,7 +567,8 @@ fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
                 .sum();
             share * share * energy
         })
-        .sum()
+        .sum();
+    bench.modelled + others
 }
 
 /// Two effects that hide each other: neither passes alone, both together do.
@@ -819,7 +837,9 @@ fn plainer(
                 .map(|(_, fit)| fit)
                 .filter(|fit| {
                     fit.model.members.last().is_some_and(|member| {
-                        exact(member) && one.equivalent.contains(&member.id())
+                        exact(member)
+                            && one.equivalent.contains(&member.id())
+                            && at_end(bench, member).is_none()
                     }) && !beaten(bench, fit, now)
                 })
                 .min_by(|a, b| a.cost.total_cmp(&b.cost))
@@ -841,14 +861,17 @@ fn name(
             let taken = share(bench, &without, now);
             // Where few rows decide, the difference of two models is never certain: who takes much less is no equal.
             let least = (EQUAL * taken).max(p99_of(step_p99, id));
+            let beside = beside(bench, now, index);
             let mut equivalent: Vec<&'static str> = others
                 .iter()
                 .filter(|(at, _)| *at == index)
                 .filter(|(_, other)| {
                     let last = other.model.members.len() - 1;
                     share(bench, &without, other) >= least
-                        && !beaten(bench, other, now)
-                        && hindrance(bench, &without, other, last, 1.0, true).is_none()
+                        // What the other effects' equations may be off by does not decide between two.
+                        && (apart(now, other) < beside || !beaten(bench, other, now))
+                        // At the end of what is physics it cannot be named, and speaks against another's being certain.
+                        && small(bench, &without, other, last, 1.0).is_none()
                 })
                 .filter_map(|(_, other)| other.model.members.last().map(Member::id))
                 .collect();
