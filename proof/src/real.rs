@@ -211,7 +211,7 @@ impl Expected {
         fs::write(
             given.join("model.toml"),
             "schema = 1\nname = \"a core without hysteresis\"\n\n[sensor]\nfront_end = \"pair\"\n\
-             reference = \"h_ref_a_per_m\"\nmeasured = \"h_meas_a_per_m\"\n",
+             reference = \"h_ref_a_per_m\"\nmeasured = \"h_meas_a_per_m\"\nquasi_static = true\n",
         )?;
         Ok(())
     }

@@ -6,6 +6,7 @@
 mod capacity;
 mod cell_self_heating;
 pub mod chain;
+mod charge_transfer;
 mod clipping;
 mod clock_skew;
 mod core_hysteresis;
@@ -40,13 +41,14 @@ use crate::problem::{Problem, View};
 use scene::{Scale, Scene};
 
 /// Every effect, in the order of the documentation's table.
-pub static LIBRARY: [&dyn Effect; 32] = [
+pub static LIBRARY: [&dyn Effect; 35] = [
     &offset::Offset,
     &gain::Gain,
     &offset_temperature::OffsetTemperature,
     &gain_temperature::GainTemperature,
     &supply_ratiometric::SupplyRatiometric,
-    &core_hysteresis::CoreHysteresis,
+    &core_hysteresis::GAPPED,
+    &core_hysteresis::CLOSED,
     &core_saturation::CoreSaturation,
     &clipping::Clipping,
     &lag::Lag,
@@ -64,10 +66,12 @@ pub static LIBRARY: [&dyn Effect; 32] = [
     &coulombic_efficiency::CoulombicEfficiency,
     &parasitic_load::ParasiticLoad,
     &capacity::Capacity,
+    &charge_transfer::ChargeTransfer,
     &polarisation::ONE_BRANCH,
     &polarisation::TWO_BRANCHES,
     &polarisation::THREE_BRANCHES,
-    &diffusion::Diffusion,
+    &diffusion::STRAIGHT_LINE,
+    &diffusion::THROUGH_OCV,
     &ocv_hysteresis::OcvHysteresis,
     &resistance_temperature::ResistanceTemperature,
     &resistance_soc::ResistanceSoc,
@@ -103,6 +107,8 @@ pub struct Parameter {
     pub internal: bool,
     /// The end of its bounds is a value like any other (a rail out of reach, a window without a pause).
     pub open: bool,
+    /// Its lower end is a value like any other (a curve that bends from the start has no knee).
+    pub from_bottom: bool,
 }
 
 impl Parameter {
@@ -114,7 +120,13 @@ impl Parameter {
             search,
             internal: false,
             open: false,
+            from_bottom: false,
         }
+    }
+
+    const fn from_bottom(mut self) -> Self {
+        self.from_bottom = true;
+        self
     }
 
     const fn open(mut self) -> Self {
@@ -130,7 +142,13 @@ impl Parameter {
             search,
             internal: true,
             open: false,
+            from_bottom: false,
         }
+    }
+
+    /// Whether it is a time, or goes by one.
+    pub fn timed(&self) -> bool {
+        matches!(self.unit, "s" | "Hz" | "ppm" | "rad")
     }
 }
 
@@ -139,8 +157,10 @@ impl Parameter {
 pub enum Stage {
     /// What flows in, and beside, the conductor.
     Conductor,
-    /// The sensor's magnetic core.
+    /// The memory of the sensor's magnetic core: the field that the current has to overcome.
     Core,
+    /// What the core's flux is limited to.
+    Saturation,
     /// The sensor's sensitivity and zero.
     Sensor,
     /// Time stamps: from when a reading is.
@@ -221,6 +241,11 @@ pub trait Effect: Sync {
         None
     }
 
+    /// Whether it is another form of the effect of the same id, and no more of it: it may be named without the smaller one.
+    fn alternative(&self) -> bool {
+        false
+    }
+
     /// Share of its own change by which its equation may be off: most are idealisations of what happens.
     fn idealised(&self) -> f64 {
         IDEALISED
@@ -230,6 +255,12 @@ pub trait Effect: Sync {
     /// profile likelihood, not from slopes.
     fn kinked(&self, _parameter: usize) -> bool {
         false
+    }
+
+    /// The value of a parameter from which on it does what a simpler effect does (a time longer than the recording): the effect is
+    /// not named then, but an equal of what is.
+    fn endless(&self, _parameter: usize, _scale: &Scale) -> f64 {
+        f64::INFINITY
     }
 
     /// What follows from the values, in plain words.
@@ -321,13 +352,16 @@ mod tests {
                 (id, names)
             })
             .collect();
-        let expected: [(&str, &[&str]); 30] = [
+        let expected: [(&str, &[&str]); 31] = [
             ("offset", &["offset_a"]),
             ("gain", &["gain"]),
             ("offset-temperature", &["tc_a_per_k"]),
             ("gain-temperature", &["tc_per_k"]),
             ("supply-ratiometric", &["ratio"]),
-            ("core-hysteresis", &["remanence_a", "coercivity_a"]),
+            (
+                "core-hysteresis",
+                &["remanence_a", "coercivity_a", "spread"],
+            ),
             ("core-saturation", &["knee_a", "softness"]),
             ("clipping", &["high_a", "low_a"]),
             ("lag", &["tau_s"]),
@@ -345,11 +379,12 @@ mod tests {
             ("coulombic-efficiency", &["efficiency"]),
             ("parasitic-load", &["load_a"]),
             ("capacity", &["capacity_ah"]),
+            ("charge-transfer", &["i0_a"]),
             (
                 "polarisation",
                 &["r1_ohm", "tau1_s", "r2_ohm", "tau2_s", "r3_ohm", "tau3_s"],
             ),
-            ("diffusion", &["r_ohm", "tau_s"]),
+            ("diffusion", &["r_ohm", "tau_s", "ocv_share"]),
             ("ocv-hysteresis", &["m_v", "gamma"]),
             ("resistance-temperature", &["b_k"]),
             ("resistance-soc", &["rise", "knee_soc"]),

@@ -26,6 +26,7 @@ use crate::report::data::{
 use crate::spectrum;
 use fit::Fit;
 use flexible::{Explainable, Features};
+use intervals::Variation;
 use select::{Selection, percent};
 use workbench::{Member, Model, Workbench};
 
@@ -47,6 +48,12 @@ const ALIKE: f64 = 0.35;
 const DOUBTFUL: f64 = 0.12;
 /// Below this ratio it is traces, wherever they sit: even a true effect's equation is a model.
 const TRACES: f64 = 0.05;
+/// An effect whose values would have to differ from stretch to stretch, each of them by this share of its energy (14 % of it, rms), is
+/// not what is there: true ones of other people's cells, whose equations are rough, stay below.
+const WAVERS: f64 = 0.02;
+/// From this share on (5 % rms, as much as an idealised equation may be off) the name is doubted: another physics of much the same
+/// shape could be behind it. The same where so much of what the effects take is left within reach of the inputs.
+const DOUBTED: f64 = 0.0025;
 /// An effect that makes the error in another file larger by this factor is not that file's physics.
 const WORSE: f64 = 1.05;
 /// A file that was never fitted confirms the effects if they bring its error down to this share.
@@ -184,6 +191,10 @@ fn one(
         .collect();
     veto(&bench, &mut selection, &others);
     vague(&bench, &mut selection);
+    let taken_back = wavering(&bench, &mut selection, &others);
+    if taken_back {
+        vague(&bench, &mut selection);
+    }
     let left = features.explain(&selection.fit.residual, options.seed);
     let confirmed = confirmed(&selection, &others);
     let verdict = judge(
@@ -195,6 +206,7 @@ fn one(
         left,
         options.seed,
     );
+    let (verdict, doubted) = doubt(&bench, &mut selection, verdict, left, confirmed, taken_back);
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);
@@ -230,7 +242,7 @@ fn one(
             rmse_before: other.rmse_before(),
             rmse_after: other.rmse(model),
         }));
-    if matches!(verdict, Verdict::Unknown | Verdict::PartlyExplained) {
+    if doubted || matches!(verdict, Verdict::Unknown | Verdict::PartlyExplained) {
         let place = locate::locate(&bench, &selection.fit.residual, options.seed)
             .into_iter()
             .next();
@@ -245,7 +257,7 @@ fn one(
     report
         .plots
         .push(plots(&bench, &selection.fit, &held_residual));
-    let sentence = sentence(&bench, &selection, verdict, left, report);
+    let sentence = sentence(&bench, &selection, (verdict, doubted), left, report);
     Part {
         verdict,
         sentence,
@@ -315,6 +327,41 @@ fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>
     }
 }
 
+/// Whether values would have to differ from stretch to stretch by more than noise makes them, and by much.
+fn waver(variation: &Variation) -> bool {
+    variation.deviations > select::CERTAIN && variation.share > WAVERS
+}
+
+/// Takes effects out again whose values would have to differ from stretch to stretch by more than noise makes them; true if there
+/// were any.
+fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>]) -> bool {
+    let mut any = false;
+    while !selection.named.is_empty() && !confirmed(selection, others) {
+        let found = intervals::variations(bench, &selection.fit)
+            .into_iter()
+            .enumerate()
+            .filter(|(_, variation)| waver(variation))
+            .max_by(|a, b| a.1.share.total_cmp(&b.1.share));
+        let Some((index, variation)) = found else {
+            break;
+        };
+        selection.refused.push(format!(
+            "{}: fits, but its values would have to differ by {} from stretch to stretch, {:.0} standard deviations more than noise: what is there is not constant",
+            selection.fit.model.members[index].id(),
+            percent(variation.share.sqrt()),
+            variation.deviations
+        ));
+        let steady = |fit: &Fit| {
+            intervals::variations(bench, fit)
+                .last()
+                .is_some_and(|variation| !waver(variation))
+        };
+        replace(bench, selection, index, "its values stay", &steady);
+        any = true;
+    }
+    any
+}
+
 /// Takes effects out again whose values the recording does not tell; where others would do as well, the best of those whose
 /// values it does tell takes the place.
 fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
@@ -336,19 +383,37 @@ fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
         selection.refused.push(format!(
             "{id}: fits, but this recording does not tell its values: {why}"
         ));
-        let without = fit::fit(bench, &selection.fit.model.without(index), None);
-        match stand_in(bench, selection, &without.model, index) {
-            Some(better) => {
-                selection.decisions.push(format!(
-                    "{} instead of {id}: as good, and the recording tells its values.",
-                    better.model.members.last().map_or("", Member::id)
-                ));
-                selection.take(index, better);
-            }
-            None => selection.fit = fit::polish(bench, &without),
-        }
-        selection.rename(bench);
+        replace(
+            bench,
+            selection,
+            index,
+            "the recording tells its values",
+            &|_| true,
+        );
     }
+}
+
+/// Takes an effect out of the model, or puts the best of its equals of which something holds in its place.
+fn replace(
+    bench: &Workbench<'_>,
+    selection: &mut Selection,
+    index: usize,
+    why: &str,
+    holds: &dyn Fn(&Fit) -> bool,
+) {
+    let id = selection.fit.model.members[index].id();
+    let without = fit::fit(bench, &selection.fit.model.without(index), None);
+    match stand_in(bench, selection, &without.model, index, holds) {
+        Some(better) => {
+            selection.decisions.push(format!(
+                "{} instead of {id}: as good, and {why}.",
+                better.model.members.last().map_or("", Member::id)
+            ));
+            selection.take(index, better);
+        }
+        None => selection.fit = fit::polish(bench, &without),
+    }
+    selection.rename(bench);
 }
 
 /// The best of what would have done as well in the place of an effect that was taken out, if the recording tells its values.
@@ -357,6 +422,7 @@ fn stand_in(
     selection: &Selection,
     without: &Model,
     index: usize,
+    holds: &dyn Fn(&Fit) -> bool,
 ) -> Option<Fit> {
     let named = selection.named.iter().find(|one| one.index == index)?;
     let clues = bench.clues(&selection.fit.predicted);
@@ -375,7 +441,10 @@ fn stand_in(
         .filter(|fit| {
             let last = fit.model.members.len() - 1;
             let intervals = intervals::intervals(bench, fit);
-            untold(&bench.scale, &fit.model.members[last], &intervals[last]).is_none()
+            let member = &fit.model.members[last];
+            select::at_end(bench, member).is_none()
+                && untold(&bench.scale, member, &intervals[last]).is_none()
+                && holds(fit)
         })
         .min_by(|a, b| a.cost.total_cmp(&b.cost))
         .map(|fit| fit::polish(bench, &fit))
@@ -553,6 +622,35 @@ fn judge(
             short((rest / unavoidable).sqrt())
         ));
     }
+    if std::env::var("TWIN_DEBUG").is_ok() {
+        let v: Vec<String> = intervals::variations(bench, &selection.fit)
+            .iter()
+            .enumerate()
+            .map(|(m, v)| {
+                let without = bench.run(&selection.fit.model.without(m));
+                let own: f64 = fit::change(&selection.fit.predicted, &without)
+                    .iter()
+                    .map(|c| c * c)
+                    .sum();
+                format!(
+                    "{}:dev={:.1},h={:.5},own={:.3}",
+                    selection.fit.model.members[m].id(),
+                    v.deviations,
+                    v.share,
+                    own / explained
+                )
+            })
+            .collect();
+        eprintln!(
+            "DEBUG excess={:.5} z={:.1} smooth={:.5} real={} lshare={:.3} {}",
+            (rest - allowed) / explained,
+            (rest - allowed) / (allowed * (2.0 / count).sqrt()),
+            left.share * rest / explained,
+            left.is_real(),
+            left.share,
+            v.join(" ")
+        );
+    }
     if smooth > 0.0 || beyond > 0.0 {
         let ratio = smooth.max(beyond) / explained.max(1e-300);
         let change = fit::change(&selection.fit.predicted, &selection.plain.predicted);
@@ -582,6 +680,59 @@ fn judge(
     } else {
         Verdict::Explained
     }
+}
+
+/// The verdict once more: names whose values waver, or that leave what follows the inputs, are the best of the library and no
+/// more; and where all names were taken back for that, the mismatch is still there. True if names are doubted.
+fn doubt(
+    bench: &Workbench<'_>,
+    selection: &mut Selection,
+    verdict: Verdict,
+    left: Explainable,
+    confirmed: bool,
+    taken_back: bool,
+) -> (Verdict, bool) {
+    if taken_back && verdict == Verdict::NoMismatch {
+        selection.decisions.push(
+            "There is a mismatch, yet the only effects that take it would have to change in the course of the recording: unknown."
+                .into(),
+        );
+        return (Verdict::Unknown, false);
+    }
+    if confirmed || selection.named.is_empty() {
+        return (verdict, false);
+    }
+    let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
+    let rest = energy(&selection.fit);
+    let reach = left.share * rest / (energy(&selection.plain) - rest).max(1e-300);
+    let wavers = intervals::variations(bench, &selection.fit)
+        .into_iter()
+        .filter(|variation| variation.deviations > select::CERTAIN)
+        .fold(0.0f64, |most, variation| most.max(variation.share));
+    let doubts = [
+        (wavers > DOUBTED).then(|| {
+            format!(
+                "its values would have to differ by {} from stretch to stretch",
+                percent(wavers.sqrt())
+            )
+        }),
+        (left.is_real() && reach > DOUBTED).then(|| {
+            format!(
+                "what is left within reach of the inputs is {} of its change",
+                percent(reach.sqrt())
+            )
+        }),
+    ];
+    let doubts: Vec<String> = doubts.into_iter().flatten().collect();
+    if doubts.is_empty() {
+        return (verdict, false);
+    }
+    selection.decisions.push(format!(
+        "{}: the best of the library, yet {}: another physics of much the same shape may be behind it.",
+        selection.fit.model.ids().join(", "),
+        doubts.join(", and ")
+    ));
+    (Verdict::Ambiguous, true)
 }
 
 /// Correlation of the sizes of two series.
@@ -749,7 +900,7 @@ fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> SignalPlots
 fn sentence(
     bench: &Workbench<'_>,
     selection: &Selection,
-    verdict: Verdict,
+    (verdict, doubted): (Verdict, bool),
     left: Explainable,
     report: &Report,
 ) -> String {
@@ -790,6 +941,10 @@ fn sentence(
             } else {
                 "what remains is louder than the stated noise".to_owned()
             }
+        ),
+        Verdict::Ambiguous if doubted => format!(
+            "{name}: explained best by {} ({figures}), but not certainly: what is left has their shape.",
+            ids.join(" and ")
         ),
         Verdict::Ambiguous => format!(
             "{name}: explained by {} ({figures}); this recording cannot tell them apart.",

@@ -84,6 +84,8 @@ pub struct Sensor {
     pub accuracy: AccuracySpec,
     /// The reference stays at its value until its next row.
     pub held_reference: bool,
+    /// Time means nothing: the order of the rows counts, not when they were measured.
+    pub quasi_static: bool,
     /// Of a board: time from the end of a conversion to the earliest row that can tell of it, in s.
     pub age_s: f64,
     /// Of a board: width of the time within which that moment is uncertain, in s.

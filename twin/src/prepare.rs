@@ -107,8 +107,8 @@ pub struct Prepared {
 
 impl Prepared {
     /// The problems alone.
-    pub fn problems(&self) -> Vec<Problem> {
-        self.items.iter().map(|item| item.problem.clone()).collect()
+    pub fn into_problems(self) -> Vec<Problem> {
+        self.items.into_iter().map(|item| item.problem).collect()
     }
 }
 
@@ -309,6 +309,7 @@ impl Work<'_> {
             full_scale: sensor.full_scale,
             range_limit: sensor.range_limit,
             held_reference: sensor.held_reference,
+            quasi_static: sensor.quasi_static,
             alignment_s: sensor.alignment_s,
             ..SensorBase::default()
         };

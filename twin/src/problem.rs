@@ -89,6 +89,8 @@ pub struct SensorBase {
     pub range_limit: Option<f64>,
     /// True if the reference stays at its value until its next row instead of going there in a straight line.
     pub held_reference: bool,
+    /// True if the recording's time means nothing (a loop measured point by point): no effect goes by the clock.
+    pub quasi_static: bool,
 }
 
 /// A battery as designed: open-circuit voltage and ohmic resistance.
@@ -104,6 +106,8 @@ pub struct BatteryBase {
     pub initial_soc_sigma: f64,
     /// Open-circuit voltage of the whole series string: state of charge (ascending) and V.
     pub ocv: Vec<(f64, f64)>,
+    /// Cells in series in what the voltage is of.
+    pub cells: f64,
     /// Ohmic resistance at 25 °C, in Ω, of the whole string.
     pub resistance_ohm: f64,
     /// Relative standard uncertainty of [`BatteryBase::resistance_ohm`]; 0: exact.

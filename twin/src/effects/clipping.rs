@@ -53,6 +53,10 @@ impl Effect for Clipping {
         starts
     }
 
+    fn kinked(&self, _parameter: usize) -> bool {
+        true
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (high, low) = (values[0], values[1]);
         scene

@@ -14,13 +14,13 @@ static CARD: Card = Card {
     statement: "The magnetic core of the sensor saturates: beyond a knee the reading falls short, smoothly.",
     equation: "y = i for abs(i) < knee; beyond: sgn(i)·(knee + e/(1 + e/(softness·knee))), e = abs(i) − knee (Fröhlich–Kennelly)",
     parameters: &[
-        Parameter::new("knee_a", "A", f64::INFINITY, Search::Logarithmic),
+        Parameter::new("knee_a", "A", f64::INFINITY, Search::Logarithmic).from_bottom(),
         Parameter::new("softness", "1", 1.0, Search::Logarithmic).open(),
     ],
     shows: "beyond the knee only",
     looks_like: &["gain", "clipping"],
     separated_by: "currents well beyond the knee, of both signs",
-    stage: Stage::Core,
+    stage: Stage::Saturation,
 };
 
 impl Effect for CoreSaturation {
@@ -42,6 +42,10 @@ impl Effect for CoreSaturation {
             .into_iter()
             .flat_map(|share| [0.2, 1.0, 4.0].map(|softness| vec![share * scale.largest, softness]))
             .collect()
+    }
+
+    fn kinked(&self, parameter: usize) -> bool {
+        parameter == 0
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

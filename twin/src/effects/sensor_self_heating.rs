@@ -5,6 +5,10 @@ use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 
 /// Heat needs a second at least to reach a Hall element through its package.
 const MIN_TAU_S: f64 = 1.0;
+/// In a recording so many times shorter than τ the heat is hardly told from a gain,
+const LONG: f64 = 2.0;
+/// and so many times shorter it is one.
+const ENDLESS: f64 = 10.0;
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -35,7 +39,15 @@ impl Effect for SensorSelfHeating {
             (-most, most)
         } else {
             // What is quicker is no heat.
-            ((10.0 * scale.step_s).max(MIN_TAU_S), 2.0 * scale.span_s)
+            ((10.0 * scale.step_s).max(MIN_TAU_S), ENDLESS * scale.span_s)
+        }
+    }
+
+    fn endless(&self, parameter: usize, scale: &Scale) -> f64 {
+        if parameter == 1 {
+            LONG * scale.span_s
+        } else {
+            f64::INFINITY
         }
     }
 
@@ -44,6 +56,7 @@ impl Effect for SensorSelfHeating {
         let quickest = (20.0 * scale.step_s).max(2.0 * MIN_TAU_S);
         spaced(quickest, (0.5 * scale.span_s).max(2.0 * quickest), 6)
             .into_iter()
+            .chain([0.5 * ENDLESS * scale.span_s])
             .map(|tau| vec![small, tau])
             .collect()
     }

@@ -42,6 +42,7 @@ pub struct Features {
     columns: Vec<Vec<f64>>,
     gram: DMatrix<f64>,
     folds: Folds,
+    timeless: bool,
 }
 
 impl Features {
@@ -87,6 +88,7 @@ impl Features {
             columns,
             gram,
             folds: Folds::new(grams),
+            timeless: bench.quasi_static(),
         }
     }
 
@@ -118,7 +120,7 @@ impl Features {
         let drive = self.columns.get(1).map_or(&residual[..], Vec::as_slice);
         let repeats: Vec<bool> = turns
             .iter()
-            .map(|turn| repeats(&residual, *turn) || repeats(drive, *turn))
+            .map(|turn| self.timeless || repeats(&residual, *turn) || repeats(drive, *turn))
             .collect();
         let signs: Vec<Vec<f64>> = turns
             .iter()

@@ -17,7 +17,7 @@ use std::ops::Range;
 
 use nalgebra::{DMatrix, DVector};
 
-use super::fit::{Fit, Slope, fit as refit, loss, normal, solve, weights};
+use super::fit::{Fit, Slope, change, dot, fit as refit, loss, normal, solve, weights};
 use super::workbench::{Model, Workbench};
 use crate::effects::{Parameter, Search};
 
@@ -66,6 +66,27 @@ fn stretches(bench: &Workbench<'_>) -> Vec<Range<usize>> {
         .collect()
 }
 
+/// Normal equations of a stretch.
+type Part = (DMatrix<f64>, DVector<f64>);
+
+/// Normal equations of each stretch.
+fn parts(bench: &Workbench<'_>, fit: &Fit, slope: &Slope, weights: &[f64]) -> Vec<Part> {
+    stretches(bench)
+        .into_iter()
+        .map(|rows| normal(&slope.columns, weights, &fit.residual, rows))
+        .collect()
+}
+
+/// Normal equations of the whole, with what the model file says of the base.
+fn sum(slope: &Slope, parts: &[Part]) -> Part {
+    let (mut whole, mut right) = slope.prior();
+    for (matrix, side) in parts {
+        whole += matrix;
+        right += side;
+    }
+    (whole, right)
+}
+
 /// Inverse of a normal matrix, column by column.
 fn inverse(matrix: &DMatrix<f64>) -> DMatrix<f64> {
     let size = matrix.nrows();
@@ -82,17 +103,9 @@ fn inverse(matrix: &DMatrix<f64>) -> DMatrix<f64> {
 fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope) -> Certainty {
     let size = slope.len();
     let weights = weights(&fit.residual, fit.sigma);
-    let (prior, prior_right) = slope.prior();
-    let stretches = stretches(bench);
-    let parts: Vec<(DMatrix<f64>, DVector<f64>)> = stretches
-        .iter()
-        .map(|rows| normal(&slope.columns, &weights, &fit.residual, rows.clone()))
-        .collect();
-    let (mut whole, mut right) = (prior, prior_right);
-    for (matrix, side) in &parts {
-        whole += matrix;
-        right += side;
-    }
+    let parts = parts(bench, fit, slope, &weights);
+    let (whole, right) = sum(slope, &parts);
+    let stated = slope.prior().0;
     // What the whole would still step is no spread.
     let rest = solve(&whole, &right, 1e-9);
     let count = parts.len() as f64;
@@ -139,19 +152,80 @@ fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope) -> Certainty {
             })
             .collect();
         let white = variance * influence.iter().map(|a| a * a).sum::<f64>();
-        let by_noise = bench.carried(&influence).unwrap_or(white);
+        let by_noise = bench.carried(0, &influence).unwrap_or(white);
+        // What the model file says of the base is as uncertain as it says.
+        let by_base: f64 = (0..size)
+            .map(|j| inverted[(k, j)].powi(2) * stated[(j, j)])
+            .sum();
         let (sum, squares) = told[k];
         let freedom = (sum * sum / squares.max(1e-300)).min(count - 1.0);
-        let mut most = NORMAL * by_noise.sqrt();
+        let mut most = NORMAL * (by_noise + by_base).sqrt();
         let mut times = by_noise / white.max(1e-300);
         if freedom >= LEAST_FREEDOM {
-            most = most.max(student(freedom) * by_stretches[k].sqrt());
+            most = most.max(student(freedom) * (by_stretches[k] + by_base).sqrt());
             times = times.max(by_stretches[k] / white.max(1e-300));
         }
         half.push(most);
         inflation.push(times.max(1.0));
     }
     Certainty { half, inflation }
+}
+
+/// How much a member's values differ from stretch to stretch.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Variation {
+    /// What values of their own for each stretch take of the loss, beyond what noise gives them, in standard deviations.
+    pub deviations: f64,
+    /// The same as energy, in the view's unit squared, summed over rows, as a share of the energy of the member's change.
+    pub share: f64,
+}
+
+/// For each member, how much its values differ from stretch to stretch (Chow's test, over all stretches at once): those of a true
+/// effect stay, those of a stand-in follow what it stands for.
+pub fn variations(bench: &Workbench<'_>, fit: &Fit) -> Vec<Variation> {
+    let slope = fit.slope(bench);
+    let weights = weights(&fit.residual, fit.sigma);
+    let stretches = stretches(bench);
+    let parts = parts(bench, fit, &slope, &weights);
+    let (whole, right) = sum(&slope, &parts);
+    let rest = solve(&whole, &right, 1e-9);
+    let freedom = fit.residual.len().saturating_sub(slope.len()).max(1) as f64;
+    let loudness = 2.0 * loss(&fit.residual, fit.sigma) / freedom;
+    let members = fit.model.members.iter().enumerate();
+    members
+        .map(|(m, member)| {
+            let own: Vec<usize> = (0..member.values.len())
+                .filter_map(|p| slope.index(m, p))
+                .collect();
+            let (mut taken, mut expected, mut variance) = (0.0, 0.0, 0.0);
+            for ((matrix, side), rows) in parts.iter().zip(&stretches) {
+                let score = side - matrix * &rest;
+                let score = DVector::from_fn(own.len(), |a, _| score[own[a]]);
+                let here = DMatrix::from_fn(own.len(), own.len(), |a, b| matrix[(own[a], own[b])]);
+                taken += score.dot(&solve(&here, &score, 1e-12));
+                let by_noise: f64 = own
+                    .iter()
+                    .filter(|&&k| matrix[(k, k)] > 0.0)
+                    .map(|&k| {
+                        let column = &slope.columns[k][rows.clone()];
+                        let weighted = column.iter().zip(&weights[rows.clone()]);
+                        let weighted: Vec<f64> = weighted.map(|(c, w)| c * w).collect();
+                        let stated = bench.carried(rows.start, &weighted).unwrap_or(0.0);
+                        loudness.max(stated / matrix[(k, k)])
+                    })
+                    .sum();
+                expected += by_noise;
+                variance += 2.0 * by_noise * by_noise / own.len() as f64;
+            }
+            let without = bench.run(&fit.model.without(m));
+            let change = change(&fit.predicted, &without);
+            let energy = dot(&change, &change).max(1e-300);
+            Variation {
+                deviations: (taken - expected) / variance.sqrt().max(1e-300),
+                share: (taken - expected).max(0.0) * fit.sigma * fit.sigma / energy,
+            }
+        })
+        .collect()
 }
 
 /// An interval for each parameter of each member.

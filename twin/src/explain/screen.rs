@@ -211,7 +211,8 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
         })
         .collect();
     entries.sort_by(|a, b| b.gain.total_cmp(&a.gain));
-    let placebo_p99 = placebos(&entries, &residual, &thin.blocks, seed, draws);
+    let timeless = bench.quasi_static();
+    let placebo_p99 = placebos(&entries, &residual, &thin.blocks, timeless, seed, draws);
     Screening {
         entries,
         placebo_p99,
@@ -263,6 +264,7 @@ fn may_join(model: &Model, effect: &'static dyn Effect) -> bool {
     let same = model.members.iter().find(|member| member.id() == card.id);
     let branches = card.parameters.len();
     match same {
+        None if effect.alternative() => true,
         None => crate::effects::LIBRARY
             .iter()
             .filter(|other| other.card().id == card.id)
@@ -469,6 +471,7 @@ fn placebos(
     entries: &[Entry],
     residual: &[f64],
     blocks: &[std::ops::Range<usize>],
+    timeless: bool,
     seed: u64,
     draws: usize,
 ) -> f64 {
@@ -497,11 +500,12 @@ fn placebos(
     }
     let all = dot(residual, residual).max(1e-300);
     let likeness = Likeness::new(count);
-    // A residual that is much the same when it is moved (one pulse, a constant) is a placebo for nothing.
+    // A residual that is much the same when it is moved (one pulse, a constant) is a placebo for nothing; nor is there anything
+    // to move it by where time means nothing.
     let same: Vec<bool> = likeness
         .of(residual, &turns)
         .into_iter()
-        .map(|alike| alike.abs() > ITSELF)
+        .map(|alike| timeless || alike.abs() > ITSELF)
         .collect();
     let columns: Vec<&[f64]> = entries
         .iter()

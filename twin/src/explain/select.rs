@@ -26,7 +26,7 @@ const FLOOR: f64 = 0.04;
 const PLACE: f64 = 0.12;
 /// Standard deviations of the stated noise that an effect has to be away from nothing: one in a thousand recordings has an effect
 /// of some thirty by chance that is 4.2 away.
-const CERTAIN: f64 = 4.2;
+pub const CERTAIN: f64 = 4.2;
 /// Rows where an effect changes the reading by at least this share of its largest change are where it acts.
 const ACTS: f64 = 0.2;
 /// Share of the held-out error from which on a single effect is clear by itself.
@@ -416,6 +416,17 @@ fn obstacle(
     index: usize,
     gain: f64,
 ) -> Option<String> {
+    small(bench, before, after, index, gain).or_else(|| at_end(bench, &after.model.members[index]))
+}
+
+/// The first two of these.
+fn small(
+    bench: &Workbench<'_>,
+    before: &Fit,
+    after: &Fit,
+    index: usize,
+    gain: f64,
+) -> Option<String> {
     let member = &after.model.members[index];
     let card = member.effect.card();
     let without = bench.run(&after.model.without(index));
@@ -445,7 +456,11 @@ fn obstacle(
         ));
     }
     let beside = beside(bench, after, index);
-    let all: f64 = change.iter().map(|c| c * c).sum();
+    let mut all: f64 = change.iter().map(|c| c * c).sum();
+    if before.model.members.len() < after.model.members.len() {
+        // What the others would do in its place is theirs.
+        all = all.min(apart(before, after));
+    }
     if all < beside {
         return Some(format!(
             "{:.2} rms, which the equations of the others may be off by ({:.2})",
@@ -476,6 +491,12 @@ fn obstacle(
             f64::sqrt(accuracy / rows)
         ));
     }
+    None
+}
+
+/// What of an effect's values would be at the end of what is physics.
+pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
+    let card = member.effect.card();
     for (p, parameter) in card
         .parameters
         .iter()
@@ -484,6 +505,13 @@ fn obstacle(
     {
         let (low, high) = member.effect.bounds(p, &bench.scale);
         let value = member.values[p];
+        let endless = member.effect.endless(p, &bench.scale);
+        if value >= endless {
+            return Some(format!(
+                "{} would be {value:.4}, more than the recording tells",
+                parameter.name
+            ));
+        }
         let margin = match parameter.search {
             Search::Logarithmic => value * 0.01,
             Search::Stepped if low > 0.0 => value * 0.01,
@@ -499,6 +527,8 @@ fn obstacle(
         if let Some(end) = end
             && end != 0.0
             && !parameter.open
+            && value < endless
+            && !(parameter.from_bottom && end == low)
         {
             return Some(format!(
                 "{} would be at the end of what is physics, {end:.4}",
@@ -509,10 +539,18 @@ fn obstacle(
     None
 }
 
-/// Energy by which the other effects' equations may be off.
+/// Energy by which two models' simulations are apart.
+fn apart(one: &Fit, other: &Fit) -> f64 {
+    change(&one.predicted, &other.predicted)
+        .iter()
+        .map(|change| change * change)
+        .sum()
+}
+
+/// Energy by which the other effects' equations may be off, those of the model file among them.
 fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
     let members = &fit.model.members;
-    (0..members.len())
+    let others: f64 = (0..members.len())
         .filter(|other| *other != index)
         .map(|other| {
             let share = members[other].effect.idealised();
@@ -529,7 +567,8 @@ fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
                 .sum();
             share * share * energy
         })
-        .sum()
+        .sum();
+    bench.modelled + others
 }
 
 /// Two effects that hide each other: neither passes alone, both together do.
@@ -798,7 +837,9 @@ fn plainer(
                 .map(|(_, fit)| fit)
                 .filter(|fit| {
                     fit.model.members.last().is_some_and(|member| {
-                        exact(member) && one.equivalent.contains(&member.id())
+                        exact(member)
+                            && one.equivalent.contains(&member.id())
+                            && at_end(bench, member).is_none()
                     }) && !beaten(bench, fit, now)
                 })
                 .min_by(|a, b| a.cost.total_cmp(&b.cost))
@@ -820,14 +861,17 @@ fn name(
             let taken = share(bench, &without, now);
             // Where few rows decide, the difference of two models is never certain: who takes much less is no equal.
             let least = (EQUAL * taken).max(p99_of(step_p99, id));
+            let beside = beside(bench, now, index);
             let mut equivalent: Vec<&'static str> = others
                 .iter()
                 .filter(|(at, _)| *at == index)
                 .filter(|(_, other)| {
                     let last = other.model.members.len() - 1;
                     share(bench, &without, other) >= least
-                        && !beaten(bench, other, now)
-                        && obstacle(bench, &without, other, last, 1.0).is_none()
+                        // What the other effects' equations may be off by does not decide between two.
+                        && (apart(now, other) < beside || !beaten(bench, other, now))
+                        // At the end of what is physics it cannot be named, and speaks against another's being certain.
+                        && small(bench, &without, other, last, 1.0).is_none()
                 })
                 .filter_map(|(_, other)| other.model.members.last().map(Member::id))
                 .collect();
@@ -858,7 +902,10 @@ fn beaten(bench: &Workbench<'_>, other: &Fit, chosen: &Fit) -> bool {
     let mean = differences.iter().sum::<f64>() / count;
     let variance =
         differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
-    mean > BEATEN * (variance / count).sqrt()
+    // Noise with a memory tells two models apart by no more than what it does along their difference, however many the rows.
+    let apart = change(&other.predicted, &chosen.predicted);
+    let stated = bench.carried(0, &apart).unwrap_or(0.0).sqrt() / (sigma * sigma * count);
+    mean > BEATEN * (variance / count).sqrt().max(stated)
 }
 
 /// Whether a model owes what it gains to the alignment of samples that its effect sets free, and not to the effect.

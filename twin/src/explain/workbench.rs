@@ -10,7 +10,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 
 use crate::effects::chain::{Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
-use crate::effects::{Clues, Effect, LIBRARY, Stage};
+use crate::effects::{Clues, Effect, LIBRARY, Parameter, Stage, find_with};
 use crate::problem::{Base, Problem, View};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row).
@@ -105,6 +105,8 @@ pub struct Workbench<'a> {
     pub blocks: Vec<Range<usize>>,
     /// Effects that may be named.
     pub library: Vec<&'static dyn Effect>,
+    /// Energy by which the equations of the effects that the model file has may be off.
+    pub modelled: f64,
     /// Fits that were made: from which model to which, with spread and loss.
     known: Mutex<HashMap<Key, (Model, f64, f64)>>,
 }
@@ -159,20 +161,38 @@ impl<'a> Workbench<'a> {
         };
         let scale = scale(problem, &t_s, &y, &plain);
         let blocks = blocks(&rows);
+        let quasi_static = matches!(&problem.base, Base::Sensor(base) if base.quasi_static);
         let library = LIBRARY
             .iter()
             .copied()
             .filter(|effect| {
                 let id = effect.card().id;
                 effect.applies(problem)
+                    && !(quasi_static && effect.card().parameters.iter().any(Parameter::timed))
                     && !without.iter().any(|name| name == id)
                     && !problem.modelled.iter().any(|(known, _)| *known == id)
             })
             .collect();
+        let modelled = (0..problem.modelled.len())
+            .map(|index| {
+                let (id, values) = &problem.modelled[index];
+                let share = find_with(id, values.len()).map_or(0.0, |effect| effect.idealised());
+                let mut without = problem.clone();
+                without.modelled.remove(index);
+                let without = Chain::new(&without).run(&[], Nuisance::default());
+                let energy: f64 = rows
+                    .iter()
+                    .map(|&row| (all[row] - without[row]).powi(2))
+                    .filter(|change| change.is_finite())
+                    .sum();
+                share * share * energy
+            })
+            .sum();
         Self {
             problem,
             chain,
             scale,
+            modelled,
             rows,
             t_s,
             y,
@@ -231,16 +251,16 @@ impl<'a> Workbench<'a> {
             .sum()
     }
 
-    /// Variance of a weighted sum of readings, `aᵀΣa`, under the noise that the model file states, with Σ of an exponential
-    /// memory and white noise; `None` if it states none with a memory.
-    pub fn carried(&self, weights: &[f64]) -> Option<f64> {
+    /// Variance of a weighted sum of readings from a row on, `aᵀΣa`, under the noise that the model file states, with Σ of an
+    /// exponential memory and white noise; `None` if it states none with a memory.
+    pub fn carried(&self, from: usize, weights: &[f64]) -> Option<f64> {
         let coloured = self.problem.coloured;
         if !(coloured.rms > 0.0 && coloured.tau_s > 0.0) {
             return None;
         }
         let (mut energy, mut together, mut memory) = (0.0, 0.0, 0.0);
         let mut last: Option<(f64, f64)> = None;
-        for (t, a) in self.t_s.iter().zip(weights) {
+        for (t, a) in self.t_s[from..].iter().zip(weights) {
             if let Some((before, previous)) = last {
                 memory = (memory + previous) * (-(t - before).max(0.0) / coloured.tau_s).exp();
             }
@@ -255,10 +275,15 @@ impl<'a> Workbench<'a> {
     /// on the change has the variance `cᵀΣc`. Infinite if none is stated.
     pub fn deviations(&self, change: &[f64]) -> f64 {
         let energy: f64 = change.iter().map(|c| c * c).sum();
-        match self.carried(change) {
+        match self.carried(0, change) {
             Some(variance) => energy / variance.max(1e-300).sqrt(),
             None => f64::INFINITY,
         }
+    }
+
+    /// Whether time means nothing in this recording.
+    pub fn quasi_static(&self) -> bool {
+        matches!(&self.problem.base, Base::Sensor(base) if base.quasi_static)
     }
 
     /// The simulation at the rows that count.
@@ -416,6 +441,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         Base::Battery(base) => {
             scale.capacity_ah = base.capacity_ah;
             scale.resistance_ohm = base.resistance_ohm;
+            scale.cells = base.cells;
         }
     }
     scale

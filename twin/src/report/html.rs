@@ -246,7 +246,7 @@ fn places(page: &mut String, report: &Report) {
     );
     if report.locations.is_empty() {
         page.push_str(if report.verdict == Verdict::NoMismatch {
-            "<p>Nowhere: no stretch of time, operating region or frequency holds more of the difference than its share of the samples.</p>\n</section>\n"
+            "<p>Not looked for: there is no mismatch to be placed.</p>\n</section>\n"
         } else {
             "<p>No place stands out: the mismatch is spread over time, operating regions and frequencies as the samples are.</p>\n</section>\n"
         });
