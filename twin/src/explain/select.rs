@@ -202,10 +202,13 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                     named = name(bench, &now, &others, &step_p99);
                 }
                 // Small, and as well explained by many others: that is structure, and no name.
-                let Some(vague) = named
-                    .iter()
-                    .find(|one| one.equivalent.len() >= VAGUE && one.held_out_gain < SMALL)
-                else {
+                let Some(vague) = named.iter().find(|one| {
+                    // One with thousands of periods to choose from is an equal of any small delay.
+                    let told = one.equivalent.iter().filter(|id| {
+                        find(id).is_some_and(|effect| effect.choices(&bench.scale) <= 1.0)
+                    });
+                    told.count() >= VAGUE && one.held_out_gain < SMALL
+                }) else {
                     break (now, named);
                 };
                 refused.push(format!(
