@@ -290,6 +290,12 @@ fn missed(bench: &Workbench<'_>, mut now: Fit) -> Fit {
     now
 }
 
+/// Whether a value is so far beyond what the recording tells that the effect does what a simpler one does.
+fn endless(bench: &Workbench<'_>, member: &Member) -> bool {
+    let mut values = member.values.iter().enumerate();
+    values.any(|(p, value)| *value >= member.effect.endless(p, &bench.scale))
+}
+
 /// Fits the most promising entries in place of nothing.
 fn fits(
     bench: &Workbench<'_>,
@@ -300,7 +306,7 @@ fn fits(
 ) -> Vec<(Fit, f64)> {
     let mut chosen: Vec<&Entry> = Vec::new();
     let mut effects: Vec<(&'static str, usize, usize)> = Vec::new();
-    for entry in entries {
+    for entry in entries.iter().filter(|entry| !endless(bench, &entry.member)) {
         let key = (entry.member.id(), entry.member.values.len());
         match effects.iter().position(|(id, size, _)| (*id, *size) == key) {
             Some(at) if effects[at].2 < starts => effects[at].2 += 1,
