@@ -23,7 +23,11 @@ FEWEST, MOST = 200, 8000
 """Rows of a case: US06 empties the cell soon after the most."""
 TRIES = 8
 """So often the size of an effect is tried."""
-OTHER_DRIVE = {"us06": "hwfet", "hwfet": "us06"}
+OTHER_DRIVE = {"us06": "hwfet", "hwfet": "us06", "hppc": "us06"}
+STEADY_A = 0.05
+"""A current that changes by less from row to row is steady."""
+LONGEST_STEADY_S = 120.0
+"""Longer rests and discharges of the pulse test are cut to this."""
 
 Ladder = tuple[tuple[float, float], ...]
 """Pairs of resistance in Ω and time constant in s."""
@@ -43,7 +47,14 @@ def drive_a(drive: str, rows: int, start_s: float = 0.0) -> np.ndarray:
 @functools.cache
 def _recorded(drive: str) -> tuple[np.ndarray, np.ndarray]:
     table = np.genfromtxt(RECORDINGS / f"panasonic-18650pf/25c-{drive}.csv", delimiter=",", names=True, usecols=("t_s", "i_ref_a"))
-    return table["t_s"], table["i_ref_a"]
+    if drive != "hppc":
+        return table["t_s"], table["i_ref_a"]
+    even_s = np.arange(0.0, table["t_s"][-1], STEP_S)
+    even_a = np.interp(even_s, table["t_s"], table["i_ref_a"])
+    changes = np.flatnonzero(np.abs(np.diff(even_a)) > STEADY_A) + 1
+    since = np.arange(len(even_a)) - np.repeat([0, *changes], np.diff([0, *changes, len(even_a)]))
+    kept_a = even_a[since * STEP_S <= LONGEST_STEADY_S]
+    return np.arange(len(kept_a)) * STEP_S, kept_a
 
 
 def low_pass(current: np.ndarray, tau_s: float) -> np.ndarray:

@@ -58,6 +58,9 @@ enum Command {
         /// The checkout's top folder
         #[arg(long, default_value = ".")]
         root: PathBuf,
+        /// Added to the seed of every case
+        #[arg(long, default_value_t = plan::SEEDS)]
+        seeds: u64,
     },
 }
 
@@ -99,6 +102,9 @@ struct Run {
     /// Only cases whose id has this in it
     #[arg(long)]
     only: Option<String>,
+    /// Added to the seed of every case: other data of the same kinds
+    #[arg(long, default_value_t = plan::SEEDS)]
+    seeds: u64,
     /// Begin no case after so many minutes; the next run goes on there
     #[arg(long)]
     minutes: Option<u64>,
@@ -117,18 +123,20 @@ fn main() -> ExitCode {
                 ExitCode::from(MISSING)
             }
         },
-        Command::List { plan, root } => match real::expected(&root.join("proof/expected.toml")) {
-            Ok(real) => {
-                for planned in plan::plan(plan, &real) {
-                    println!("{}", planned.case.id);
+        Command::List { plan, root, seeds } => {
+            match real::expected(&root.join("proof/expected.toml")) {
+                Ok(real) => {
+                    for planned in plan::plan(plan, &real, seeds) {
+                        println!("{}", planned.case.id);
+                    }
+                    ExitCode::SUCCESS
                 }
-                ExitCode::SUCCESS
+                Err(error) => {
+                    eprintln!("error: {error:#}");
+                    ExitCode::from(MISSING)
+                }
             }
-            Err(error) => {
-                eprintln!("error: {error:#}");
-                ExitCode::from(MISSING)
-            }
-        },
+        }
     }
 }
 
@@ -137,7 +145,7 @@ fn run(arguments: &Run) -> Result<bool> {
         |path: &PathBuf| std::path::absolute(path).with_context(|| path.display().to_string());
     let root = absolute(&arguments.root)?;
     let real = real::expected(&root.join("proof/expected.toml"))?;
-    let mut plan = plan::plan(arguments.plan, &real);
+    let mut plan = plan::plan(arguments.plan, &real, arguments.seeds);
     if let Some(part) = &arguments.only {
         plan.retain(|planned| planned.case.id.contains(part.as_str()));
     }

@@ -8,6 +8,7 @@ use std::{
 };
 
 use anyhow::{Context, Result, bail};
+use serde::{Deserialize, Serialize};
 
 use crate::{
     case::{Case, Planned},
@@ -52,17 +53,50 @@ impl Folders {
         Ok(())
     }
 
+    /// Takes away what an earlier run of the tool and of the methods wrote.
+    pub fn data_only(&self) -> Result<()> {
+        for folder in [
+            self.given.join("out"),
+            self.given.join("again"),
+            self.given.join("without"),
+            self.case.join("methods"),
+        ] {
+            if folder.exists() {
+                fs::remove_dir_all(&folder)
+                    .with_context(|| format!("removing {}", folder.display()))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Over the data, with what is held out.
+    pub fn hash(&self) -> Result<String> {
+        let mut all = String::new();
+        for folder in [&self.given, &self.kept] {
+            for file in files(folder)? {
+                all.push_str(&hash_file(&file)?);
+            }
+        }
+        Ok(hash(all.as_bytes()))
+    }
+
     /// What the tool is given, for the seal.
     pub fn inputs(&self) -> Result<Vec<PathBuf>> {
-        let mut inputs: Vec<PathBuf> = fs::read_dir(&self.given)?
-            .collect::<std::io::Result<Vec<_>>>()?
-            .into_iter()
-            .map(|entry| entry.path())
-            .filter(|path| path.is_file())
-            .collect();
-        inputs.sort();
-        Ok(inputs)
+        files(&self.given)
     }
+}
+
+/// Files of a folder, by name.
+fn files(folder: &Path) -> Result<Vec<PathBuf>> {
+    let mut files: Vec<PathBuf> = fs::read_dir(folder)
+        .with_context(|| format!("reading {}", folder.display()))?
+        .collect::<std::io::Result<Vec<_>>>()?
+        .into_iter()
+        .map(|entry| entry.path())
+        .filter(|path| path.is_file())
+        .collect();
+    files.sort();
+    Ok(files)
 }
 
 /// Python and its programs.
@@ -74,13 +108,66 @@ pub struct Makers {
 }
 
 impl Makers {
-    /// Over everything that decides what is made.
-    pub fn hash(&self) -> Result<String> {
-        hash_of_sources(&self.folder)
+    /// Over everything that decides what a maker makes: its source, and those that it imports.
+    pub fn hash(&self, maker: &str) -> Result<String> {
+        let mut all = String::new();
+        let mut open = vec!["make".to_owned(), maker.to_owned()];
+        let mut known = Vec::new();
+        while let Some(module) = open.pop() {
+            let path = self.folder.join(format!("{module}.py"));
+            if known.contains(&module) || !path.exists() {
+                continue;
+            }
+            let text =
+                fs::read_to_string(&path).with_context(|| format!("reading {}", path.display()))?;
+            all.push_str(&hash(text.as_bytes()));
+            open.extend(imports(&text));
+            known.push(module);
+        }
+        Ok(hash(all.as_bytes()))
     }
 
-    /// Makes a batch. What could not be made is told by case; the others' files are in place, their truths taken away.
+    /// Makes what of a batch is not there from an earlier run. What could not be made is told by case; the others' files are in
+    /// place, their truths taken away.
     pub fn make(&self, batch: &[Planned], out: &Path, safe: &Safe) -> Result<Vec<Option<String>>> {
+        let mut keys = Vec::new();
+        for planned in batch {
+            let case = &planned.case;
+            let text = serde_json::to_string(case)? + &self.hash(&case.maker)?;
+            keys.push(hash(text.as_bytes()));
+        }
+        let there = |planned: &Planned, key: &str| {
+            Made::read(&Folders::new(out, &planned.case.id)).filter(|made| made.key == key)
+        };
+        let open: Vec<Planned> = batch
+            .iter()
+            .zip(&keys)
+            .filter(|(planned, key)| there(planned, key).is_none())
+            .map(|(planned, _)| planned.clone())
+            .collect();
+        let mut new = Vec::new();
+        if !open.is_empty() {
+            new = self.anew(&open, out, safe)?;
+        }
+        let mut new = new.into_iter();
+        let mut results = Vec::new();
+        for (planned, key) in batch.iter().zip(keys) {
+            let folders = Folders::new(out, &planned.case.id);
+            let not_made = match there(planned, &key) {
+                Some(made) => made.not_made,
+                None => {
+                    let not_made = new.next().flatten();
+                    let made = Made { key, not_made };
+                    made.write(&folders)?;
+                    made.not_made
+                }
+            };
+            results.push(not_made);
+        }
+        Ok(results)
+    }
+
+    fn anew(&self, batch: &[Planned], out: &Path, safe: &Safe) -> Result<Vec<Option<String>>> {
         let mut list = Vec::new();
         for planned in batch {
             let folders = Folders::new(out, &planned.case.id);
@@ -129,6 +216,45 @@ impl Makers {
     }
 }
 
+/// Modules that a Python source imports by name, ours and others'.
+fn imports(text: &str) -> Vec<String> {
+    text.lines()
+        .filter_map(|line| {
+            let mut words = line.split_whitespace();
+            match words.next() {
+                Some("import" | "from") => words.next(),
+                _ => None,
+            }
+        })
+        .map(|module| module.trim_end_matches(',').to_owned())
+        .collect()
+}
+
+/// What a case's folder was made from, for the next run.
+#[derive(Serialize, Deserialize)]
+struct Made {
+    /// Over the case and the maker's sources.
+    key: String,
+    /// Why there is no data.
+    not_made: Option<String>,
+}
+
+impl Made {
+    fn path(folders: &Folders) -> PathBuf {
+        folders.case.join("made.json")
+    }
+
+    fn read(folders: &Folders) -> Option<Self> {
+        serde_json::from_str(&fs::read_to_string(Self::path(folders)).ok()?).ok()
+    }
+
+    fn write(&self, folders: &Folders) -> Result<()> {
+        let path = Self::path(folders);
+        fs::write(&path, serde_json::to_string(self)?)
+            .with_context(|| format!("writing {}", path.display()))
+    }
+}
+
 /// Splits what was made: to the tool, held out, and sealed away.
 fn take(planned: &Planned, pair: &[PathBuf; 2], out: &Path, safe: &Safe) -> Result<()> {
     let folders = Folders::new(out, &planned.case.id);
@@ -163,17 +289,8 @@ pub fn one_thread(command: &mut Command) {
 
 /// Over the Python files of a folder, by name.
 pub fn hash_of_sources(folder: &Path) -> Result<String> {
-    let mut files: Vec<PathBuf> = fs::read_dir(folder)
-        .with_context(|| format!("reading {}", folder.display()))?
-        .collect::<std::io::Result<Vec<_>>>()?
-        .into_iter()
-        .map(|entry| entry.path())
-        .filter(|path| {
-            path.extension()
-                .is_some_and(|ending| ending == "py" || ending == "cir")
-        })
-        .collect();
-    files.sort();
+    let mut files = files(folder)?;
+    files.retain(|path| path.extension().is_some_and(|ending| ending == "py"));
     let mut all = String::new();
     for file in files {
         all.push_str(&hash_file(&file)?);

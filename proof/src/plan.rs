@@ -53,6 +53,8 @@ const NOISES: [&str; 3] = ["white", "coloured", "quantised"];
 const DRIVES: [&str; 3] = ["us06", "hwfet", "gpu"];
 /// Drives of the battery's makers.
 const CELL_DRIVES: [&str; 2] = ["us06", "hwfet"];
+/// A third one: pulses between rests.
+const PULSES: &str = "hppc";
 /// Rows of a case of the sensing chain: a little less than seven minutes at 10 Hz.
 const ROWS: usize = 4000;
 /// Rows of a circuit: five minutes.
@@ -184,7 +186,31 @@ struct New<'a> {
     options: Map<String, Value>,
 }
 
-impl New<'_> {
+impl<'a> New<'a> {
+    /// With what most cases of the sensing chain have.
+    fn sensing(group: Group, effects: &'a [&'a str]) -> Self {
+        Self {
+            group,
+            maker: "sensing",
+            effects,
+            strength: 10.0,
+            noise: "white",
+            drive: "us06",
+            seed: 1,
+            rows: ROWS,
+            options: Map::new(),
+        }
+    }
+
+    /// The same of a cell.
+    fn battery(group: Group, effects: &'a [&'a str]) -> Self {
+        Self {
+            maker: "battery",
+            rows: BATTERY_ROWS,
+            ..Self::sensing(group, effects)
+        }
+    }
+
     fn planned(self) -> Planned {
         let effects: Vec<Concealed> = self
             .effects
@@ -339,13 +365,13 @@ fn others() -> Vec<Planned> {
 
 /// Cells by PyBaMM.
 fn cells() -> Vec<Planned> {
-    let cell = |effects: &[&str], strength, drive, more: Value| {
+    let noisy = |effects: &[&str], strength, noise, drive, more: Value| {
         New {
             group: Group::Cells,
             maker: "cells",
             effects,
             strength,
-            noise: "white",
+            noise,
             drive,
             seed: 1,
             rows: if more.get("model") == Some(&json!("dfn")) {
@@ -356,6 +382,9 @@ fn cells() -> Vec<Planned> {
             options: options(more),
         }
         .planned()
+    };
+    let cell = |effects: &[&str], strength, drive, more: Value| {
+        noisy(effects, strength, "white", drive, more)
     };
     let mut plan = Vec::new();
     // What such a cell has by nature, beside open-circuit voltage and one resistance.
@@ -393,6 +422,22 @@ fn cells() -> Vec<Planned> {
     ] {
         for (strength, drive) in [(10.0, "hwfet"), (30.0, "hwfet"), (30.0, "us06")] {
             plan.push(cell(&[effect], strength, drive, Value::Null));
+        }
+        for noise in ["coloured", "quantised"] {
+            plan.push(noisy(&[effect], 30.0, noise, "us06", Value::Null));
+        }
+    }
+    for (noise, drive) in [
+        ("coloured", "us06"),
+        ("quantised", "us06"),
+        ("white", PULSES),
+        ("coloured", PULSES),
+    ] {
+        let spme = || json!({ "model": "spme" });
+        plan.push(noisy(&["diffusion"], 10.0, noise, drive, spme()));
+        // The circuit was fitted to driving: pulses show more than it leaves there.
+        if drive != PULSES {
+            plan.push(noisy(&[], f64::INFINITY, noise, drive, spme()));
         }
     }
     // Only what such a circuit leaves.
@@ -452,7 +497,7 @@ fn single_battery() -> Vec<Planned> {
     for effect in BATTERY {
         for strength in STRENGTHS {
             for noise in NOISES {
-                for (place, drive) in CELL_DRIVES.into_iter().enumerate() {
+                for (place, drive) in CELL_DRIVES.into_iter().chain([PULSES]).enumerate() {
                     if place == 0 || noise == "white" {
                         plan.push(single(
                             "battery",
@@ -513,15 +558,11 @@ fn combined() -> Vec<Planned> {
         ] {
             plan.push(
                 New {
-                    group: Group::Combined,
-                    maker: "sensing",
-                    effects,
                     strength,
                     noise,
                     drive,
-                    seed: 1,
-                    rows: ROWS,
                     options: options(json!({ "masked": true })),
+                    ..New::sensing(Group::Combined, effects)
                 }
                 .planned(),
             );
@@ -531,15 +572,9 @@ fn combined() -> Vec<Planned> {
         for drive in CELL_DRIVES {
             plan.push(
                 New {
-                    group: Group::Combined,
-                    maker: "battery",
-                    effects,
-                    strength: 10.0,
-                    noise: "white",
                     drive,
-                    seed: 1,
-                    rows: BATTERY_ROWS,
                     options: options(json!({ "masked": true })),
+                    ..New::battery(Group::Combined, effects)
                 }
                 .planned(),
             );
@@ -554,15 +589,11 @@ fn clean() -> Vec<Planned> {
         for drive in DRIVES {
             for seed in 1..=12 {
                 let mut planned = New {
-                    group: Group::Clean,
-                    maker: "sensing",
-                    effects: &[],
                     strength: f64::INFINITY,
                     noise,
                     drive,
                     seed,
-                    rows: ROWS,
-                    options: Map::new(),
+                    ..New::sensing(Group::Clean, &[])
                 }
                 .planned();
                 if seed == 1 {
@@ -575,15 +606,11 @@ fn clean() -> Vec<Planned> {
             for seed in 1..=5 {
                 plan.push(
                     New {
-                        group: Group::Clean,
-                        maker: "battery",
-                        effects: &[],
                         strength: f64::INFINITY,
                         noise,
                         drive,
                         seed,
-                        rows: BATTERY_ROWS,
-                        options: Map::new(),
+                        ..New::battery(Group::Clean, &[])
                     }
                     .planned(),
                 );
@@ -599,15 +626,8 @@ fn outside() -> Vec<Planned> {
         for drive in CELL_DRIVES {
             plan.push(
                 New {
-                    group: Group::Outside,
-                    maker: "battery",
-                    effects: &[effect],
-                    strength: 10.0,
-                    noise: "white",
                     drive,
-                    seed: 1,
-                    rows: BATTERY_ROWS,
-                    options: Map::new(),
+                    ..New::battery(Group::Outside, &[effect])
                 }
                 .planned(),
             );
@@ -623,15 +643,10 @@ fn outside() -> Vec<Planned> {
         ] {
             plan.push(
                 New {
-                    group: Group::Outside,
-                    maker: "sensing",
-                    effects: &[effect],
                     strength,
                     noise,
                     drive,
-                    seed: 1,
-                    rows: ROWS,
-                    options: Map::new(),
+                    ..New::sensing(Group::Outside, &[effect])
                 }
                 .planned(),
             );
@@ -646,15 +661,9 @@ fn inseparable() -> Vec<Planned> {
         for drive in ["us06", "hwfet"] {
             plan.push(
                 New {
-                    group: Group::Inseparable,
-                    maker: "sensing",
-                    effects: &[effect],
-                    strength: 10.0,
-                    noise: "white",
                     drive,
-                    seed: 1,
-                    rows: ROWS,
                     options: options(json!({ "constant": [still] })),
+                    ..New::sensing(Group::Inseparable, &[effect])
                 }
                 .planned(),
             );
@@ -663,15 +672,8 @@ fn inseparable() -> Vec<Planned> {
     for drive in CELL_DRIVES {
         plan.push(
             New {
-                group: Group::Inseparable,
-                maker: "battery",
-                effects: &["offset"],
-                strength: 10.0,
-                noise: "white",
                 drive,
-                seed: 1,
-                rows: BATTERY_ROWS,
-                options: Map::new(),
+                ..New::battery(Group::Inseparable, &["offset"])
             }
             .planned(),
         );
@@ -679,15 +681,8 @@ fn inseparable() -> Vec<Planned> {
     for effect in ["gain", "core-saturation"] {
         plan.push(
             New {
-                group: Group::Inseparable,
-                maker: "sensing",
-                effects: &[effect],
-                strength: 10.0,
-                noise: "white",
                 drive: "square",
-                seed: 1,
-                rows: ROWS,
-                options: Map::new(),
+                ..New::sensing(Group::Inseparable, &[effect])
             }
             .planned(),
         );
@@ -748,8 +743,25 @@ fn is_quick(planned: &Planned) -> bool {
     }
 }
 
-/// The cases of a campaign.
-pub fn plan(extent: Extent, real: &[Expected]) -> Vec<Planned> {
+/// Added to the seeds below: with those themselves the tool was made, and what it is judged on was not looked at before.
+pub const SEEDS: u64 = 10;
+
+/// The cases of a campaign. Other `seeds` make other data of the same kinds; real recordings and the board have none.
+pub fn plan(extent: Extent, real: &[Expected], seeds: u64) -> Vec<Planned> {
+    let mut plan = cases(extent, real);
+    for planned in &mut plan {
+        let case = &mut planned.case;
+        if !case.maker.is_empty() {
+            let [old, new] =
+                [case.seed, case.seed + seeds].map(|seed| format!("_{}_{seed}", case.drive));
+            case.id = case.id.replacen(&old, &new, 1);
+            case.seed += seeds;
+        }
+    }
+    plan
+}
+
+fn cases(extent: Extent, real: &[Expected]) -> Vec<Planned> {
     let mut plan = full(real);
     if extent == Extent::Quick {
         plan.retain(is_quick);
@@ -788,7 +800,7 @@ mod tests {
 
     #[test]
     fn ids_are_unique_and_names_of_folders() {
-        let plan = plan(Extent::Full, &real());
+        let plan = plan(Extent::Full, &real(), SEEDS);
         let ids: HashSet<&str> = plan.iter().map(|one| one.case.id.as_str()).collect();
         assert_eq!(ids.len(), plan.len());
         for id in ids {
@@ -801,8 +813,20 @@ mod tests {
     }
 
     #[test]
+    fn other_seeds_are_other_cases_of_the_same_kinds() {
+        let [some, others] = [0, SEEDS].map(|seeds| plan(Extent::Full, &real(), seeds));
+        assert_eq!(some.len(), others.len());
+        for (one, other) in some.iter().zip(&others) {
+            assert_eq!(one.case.effects, other.case.effects);
+            let made = !one.case.maker.is_empty();
+            assert_eq!(made, one.case.id != other.case.id, "{}", one.case.id);
+            assert_eq!(made, one.case.seed != other.case.seed, "{}", one.case.id);
+        }
+    }
+
+    #[test]
     fn every_effect_meets_every_strength_noise_and_drive() {
-        let plan = plan(Extent::Full, &real());
+        let plan = plan(Extent::Full, &real(), SEEDS);
         let there = |effect: &str, strength: f64, noise: &str, drive: &str| {
             plan.iter().any(|one| {
                 let case = &one.case;
@@ -829,11 +853,11 @@ mod tests {
 
     #[test]
     fn the_quick_campaign_is_a_small_part_of_the_full_one() {
-        let full: HashSet<String> = plan(Extent::Full, &real())
+        let full: HashSet<String> = plan(Extent::Full, &real(), SEEDS)
             .into_iter()
             .map(|one| one.case.id)
             .collect();
-        let quick = plan(Extent::Quick, &real());
+        let quick = plan(Extent::Quick, &real(), SEEDS);
         assert!((30..=80).contains(&quick.len()), "{}", quick.len());
         assert!(quick.iter().all(|one| full.contains(&one.case.id)));
         for group in [Group::Real, Group::Single, Group::Clean, Group::Outside] {

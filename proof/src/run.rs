@@ -63,6 +63,9 @@ pub struct Record {
     pub overlap: Option<f64>,
     /// Today's methods.
     pub methods: BTreeMap<String, Found>,
+    /// Over their sources and the data: with another key they are run again.
+    #[serde(default)]
+    pub methods_key: String,
     /// Of the emulated board.
     pub calibrated: Option<Calibrated>,
     /// Seconds of the wall clock that each part took; a batch's making is shared out.
@@ -136,7 +139,7 @@ pub struct Campaign {
 /// Hashes of what decides results.
 struct Sources {
     tool: String,
-    makers: String,
+    makers: BTreeMap<String, String>,
     methods: String,
     expected: String,
     board: String,
@@ -150,7 +153,10 @@ impl Sources {
         all.push_str(match planned.group {
             Group::Real => &self.expected,
             Group::Board => &self.board,
-            _ => &self.makers,
+            _ => self
+                .makers
+                .get(&planned.case.maker)
+                .context("a case without a maker")?,
         });
         if !planned.methods.is_empty() {
             all.push_str(&self.methods);
@@ -195,7 +201,7 @@ impl Campaign {
         let results = self.out.join("results");
         fs::create_dir_all(&results).with_context(|| format!("making {}", results.display()))?;
         let safe = Safe::open(&self.out)?;
-        let sources = self.sources()?;
+        let sources = self.sources(plan)?;
         let mut records: BTreeMap<String, Record> = BTreeMap::new();
         let mut open: Vec<(Planned, String)> = Vec::new();
         for planned in plan {
@@ -255,10 +261,17 @@ impl Campaign {
     }
 
     /// What decides a result beside the case itself.
-    fn sources(&self) -> Result<Sources> {
+    fn sources(&self, plan: &[Planned]) -> Result<Sources> {
+        let mut makers = BTreeMap::new();
+        for planned in plan {
+            let maker = &planned.case.maker;
+            if !makers.contains_key(maker) {
+                makers.insert(maker.clone(), self.makers.hash(maker)?);
+            }
+        }
         Ok(Sources {
             tool: hash_file(&self.tool.program)?,
-            makers: self.makers.hash()?,
+            makers,
             methods: if self.methods.there() {
                 hash_of_sources(&self.methods.folder)?
             } else {
@@ -289,7 +302,8 @@ impl Campaign {
         };
         let made_s = start.elapsed().as_secs_f64() / batch.len() as f64;
         for ((planned, key), not_made) in batch.iter().zip(made) {
-            let record = self.case(planned, key, (not_made, made_s), safe)?;
+            let earlier = read_record(results, &planned.case.id);
+            let record = self.case(planned, key, (not_made, made_s), earlier, safe)?;
             let path = results.join(format!("{}.json", planned.case.id));
             let part = path.with_extension("part");
             fs::write(&part, serde_json::to_string(&record)?)?;
@@ -340,6 +354,7 @@ impl Campaign {
         planned: &Planned,
         key: &str,
         (not_made, made_s): (Option<String>, f64),
+        earlier: Option<Record>,
         safe: &Safe,
     ) -> Result<Record> {
         let id = &planned.case.id;
@@ -356,6 +371,7 @@ impl Campaign {
             same: None,
             overlap: None,
             methods: BTreeMap::new(),
+            methods_key: String::new(),
             calibrated: None,
             parts_s: BTreeMap::from([("make".to_owned(), made_s)]),
         };
@@ -363,6 +379,7 @@ impl Campaign {
             return Ok(record);
         }
         let folders = Folders::new(&self.out, id);
+        folders.data_only()?;
         record.truth_sha256 = safe.seal(id, &folders.inputs()?)?;
         safe.started(id)?;
         let limit = if planned.group == Group::Real {
@@ -405,12 +422,7 @@ impl Campaign {
                 (Ok(_), None) => {}
             }
         }
-        for method in &planned.methods {
-            if self.methods.there() {
-                let found = record.timed("methods", |_| self.methods.run(method, &folders));
-                record.methods.insert(method.clone(), found);
-            }
-        }
+        self.compare(&mut record, earlier, &folders)?;
 
         let opened = safe.unseal(id, &record.truth_sha256)?;
         let truth: Truth = match serde_json::from_str(&opened) {
@@ -457,6 +469,39 @@ impl Campaign {
         }
         record.truth = Some(truth);
         Ok(record)
+    }
+}
+
+impl Campaign {
+    /// Today's methods on the same data; they know nothing of the tool, so that what an earlier run found still holds for the
+    /// same data.
+    fn compare(
+        &self,
+        record: &mut Record,
+        earlier: Option<Record>,
+        folders: &Folders,
+    ) -> Result<()> {
+        let wanted = record.planned.methods.clone();
+        if wanted.is_empty() || !self.methods.there() {
+            return Ok(());
+        }
+        let sources = hash_of_sources(&self.methods.folder)?;
+        record.methods_key = hash((sources + &folders.hash()?).as_bytes());
+        let mut known = BTreeMap::new();
+        if let Some(earlier) = earlier.filter(|earlier| earlier.methods_key == record.methods_key) {
+            known = earlier.methods;
+            if let Some(took_s) = earlier.parts_s.get("methods") {
+                record.parts_s.insert("methods".to_owned(), *took_s);
+            }
+        }
+        for method in wanted {
+            let found = match known.remove(&method) {
+                Some(found) => found,
+                None => record.timed("methods", |_| self.methods.run(&method, folders)),
+            };
+            record.methods.insert(method, found);
+        }
+        Ok(())
     }
 }
 
@@ -530,6 +575,8 @@ mod tests {
     /// A maker that knows one clean recording.
     const MAKER: &str = r#"
 import json, pathlib, sys
+with open(pathlib.Path(__file__).parent / "runs", "a") as runs:
+    print("run", file=runs)
 for case, out in json.loads(pathlib.Path(sys.argv[2]).read_text()):
     out = pathlib.Path(out)
     out.mkdir()
@@ -537,6 +584,14 @@ for case, out in json.loads(pathlib.Path(sys.argv[2]).read_text()):
         (out / name).write_text("t_s,i_ref_a,i_meas_a\n0,1,1\n1,2,2\n")
     (out / "model.toml").write_text("schema = 1\n")
     (out / "truth.json").write_text('{"kind": "d", "maker": "test"}')
+"#;
+
+    /// A method that always names the same.
+    const METHOD: &str = r#"
+import json, pathlib, sys
+with open(pathlib.Path(__file__).parent / "runs", "a") as runs:
+    print("run", file=runs)
+pathlib.Path(sys.argv[3]).write_text(json.dumps({"named": ["offset"]}))
 "#;
 
     /// A tool that says "no mismatch", but fails if the seal is not on the disk or the truth is in reach.
@@ -607,13 +662,14 @@ fi
         }]
     }
 
+    fn lines(path: &Path) -> usize {
+        fs::read_to_string(path).unwrap().lines().count()
+    }
+
     #[test]
     fn a_case_is_sealed_before_the_tool_starts_and_run_once_only() {
         let folder = tempfile::tempdir().unwrap();
-        let runs = || {
-            let text = fs::read_to_string(folder.path().join("out/runs")).unwrap();
-            text.lines().count()
-        };
+        let runs = || lines(&folder.path().join("out/runs"));
         let records = campaign(folder.path(), TOOL).run(&plan()).unwrap();
         assert_eq!(records[0].error, None);
         assert_eq!(records[0].judgement().unwrap().outcome, Outcome::Quiet);
@@ -629,6 +685,39 @@ fi
             .unwrap();
         assert_eq!(runs(), 4);
         assert_ne!(other[0].key, records[0].key);
+        // The data were there; another maker makes others.
+        let made = || lines(&folder.path().join("makers/runs"));
+        assert_eq!(made(), 1);
+        let changed = campaign(folder.path(), TOOL);
+        let maker = folder.path().join("makers/make.py");
+        fs::write(maker, format!("{MAKER}# changed\n")).unwrap();
+        changed.run(&plan()).unwrap();
+        assert_eq!((runs(), made()), (6, 2));
+    }
+
+    #[test]
+    fn methods_are_run_again_for_other_data_only() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut plan = plan();
+        plan[0].methods = vec!["bic".to_owned()];
+        let with_methods = |tool: &str| {
+            let campaign = campaign(folder.path(), tool);
+            fs::create_dir_all(&campaign.methods.folder).unwrap();
+            fs::write(campaign.methods.folder.join("run.py"), METHOD).unwrap();
+            campaign
+        };
+        let runs = || lines(&folder.path().join("methods/runs"));
+        let first = with_methods(TOOL).run(&plan).unwrap();
+        assert_eq!(first[0].methods["bic"].named, ["offset"]);
+        let second = with_methods(&format!("{TOOL}# changed\n"))
+            .run(&plan)
+            .unwrap();
+        assert_eq!((runs(), &second[0].methods), (1, &first[0].methods));
+        let changed = with_methods(TOOL);
+        let other = MAKER.replace("0,1,1", "0,1,2");
+        fs::write(folder.path().join("makers/make.py"), other).unwrap();
+        changed.run(&plan).unwrap();
+        assert_eq!(runs(), 2);
     }
 
     #[test]

@@ -106,6 +106,7 @@ fn problem(rows: usize, view: View, effects: &[(&str, &[f64])]) -> Problem {
                     .map(|k| f64::from(k) / 100.0)
                     .map(|soc| (soc, 3.0 + 1.1 * soc + 0.1 * (6.0 * soc).sin()))
                     .collect(),
+                cells: 1.0,
                 resistance_ohm: 0.001,
                 resistance_sigma: 0.1,
             })

@@ -6,6 +6,7 @@
 mod capacity;
 mod cell_self_heating;
 pub mod chain;
+mod charge_transfer;
 mod clipping;
 mod clock_skew;
 mod core_hysteresis;
@@ -40,7 +41,7 @@ use crate::problem::{Problem, View};
 use scene::{Scale, Scene};
 
 /// Every effect, in the order of the documentation's table.
-pub static LIBRARY: [&dyn Effect; 33] = [
+pub static LIBRARY: [&dyn Effect; 35] = [
     &offset::Offset,
     &gain::Gain,
     &offset_temperature::OffsetTemperature,
@@ -65,10 +66,12 @@ pub static LIBRARY: [&dyn Effect; 33] = [
     &coulombic_efficiency::CoulombicEfficiency,
     &parasitic_load::ParasiticLoad,
     &capacity::Capacity,
+    &charge_transfer::ChargeTransfer,
     &polarisation::ONE_BRANCH,
     &polarisation::TWO_BRANCHES,
     &polarisation::THREE_BRANCHES,
-    &diffusion::Diffusion,
+    &diffusion::STRAIGHT_LINE,
+    &diffusion::THROUGH_OCV,
     &ocv_hysteresis::OcvHysteresis,
     &resistance_temperature::ResistanceTemperature,
     &resistance_soc::ResistanceSoc,
@@ -227,6 +230,12 @@ pub trait Effect: Sync {
         None
     }
 
+    /// Number of independent values among which the best is chosen without any of them being near another (periods, each a line
+    /// of its own in noise): 1 for a value that is followed from a start.
+    fn choices(&self, _scale: &Scale) -> f64 {
+        1.0
+    }
+
     /// What the readings show by themselves, whatever the simulation says.
     fn mark(&self, _scale: &Scale, _clues: &Clues<'_>) -> Option<Mark> {
         None
@@ -343,7 +352,7 @@ mod tests {
                 (id, names)
             })
             .collect();
-        let expected: [(&str, &[&str]); 30] = [
+        let expected: [(&str, &[&str]); 31] = [
             ("offset", &["offset_a"]),
             ("gain", &["gain"]),
             ("offset-temperature", &["tc_a_per_k"]),
@@ -370,11 +379,12 @@ mod tests {
             ("coulombic-efficiency", &["efficiency"]),
             ("parasitic-load", &["load_a"]),
             ("capacity", &["capacity_ah"]),
+            ("charge-transfer", &["i0_a"]),
             (
                 "polarisation",
                 &["r1_ohm", "tau1_s", "r2_ohm", "tau2_s", "r3_ohm", "tau3_s"],
             ),
-            ("diffusion", &["r_ohm", "tau_s"]),
+            ("diffusion", &["r_ohm", "tau_s", "ocv_share"]),
             ("ocv-hysteresis", &["m_v", "gamma"]),
             ("resistance-temperature", &["b_k"]),
             ("resistance-soc", &["rise", "knee_soc"]),

@@ -209,7 +209,14 @@ fn one(
         left,
         options.seed,
     );
-    let (verdict, doubted) = doubt(&bench, &mut selection, verdict, left, (confirmed, taken_back), options.seed);
+    let (verdict, doubted) = doubt(
+        &bench,
+        &mut selection,
+        verdict,
+        left,
+        (confirmed, taken_back),
+        options.seed,
+    );
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);
@@ -386,7 +393,13 @@ fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
         selection.refused.push(format!(
             "{id}: fits, but this recording does not tell its values: {why}"
         ));
-        replace(bench, selection, index, "the recording tells its values", &|_| true);
+        replace(
+            bench,
+            selection,
+            index,
+            "the recording tells its values",
+            &|_| true,
+        );
     }
 }
 
@@ -438,7 +451,10 @@ fn stand_in(
         .filter(|fit| {
             let last = fit.model.members.len() - 1;
             let intervals = intervals::intervals(bench, fit);
-            untold(&bench.scale, &fit.model.members[last], &intervals[last]).is_none() && holds(fit)
+            let member = &fit.model.members[last];
+            select::at_end(bench, member).is_none()
+                && untold(&bench.scale, member, &intervals[last]).is_none()
+                && holds(fit)
         })
         .min_by(|a, b| a.cost.total_cmp(&b.cost))
         .map(|fit| fit::polish(bench, &fit))
@@ -615,14 +631,6 @@ fn judge(
             "What remains is {} times the noise that the model file states.",
             short((rest / unavoidable).sqrt())
         ));
-    }
-    if std::env::var("TWIN_DEBUG").is_ok() {
-        let v: Vec<String> = intervals::variations(bench, &selection.fit).iter().enumerate().map(|(m, v)| {
-            let without = bench.run(&selection.fit.model.without(m));
-            let own: f64 = fit::change(&selection.fit.predicted, &without).iter().map(|c| c * c).sum();
-            format!("{}:dev={:.1},h={:.5},own={:.3}", selection.fit.model.members[m].id(), v.deviations, v.share, own/explained)
-        }).collect();
-        eprintln!("DEBUG excess={:.5} z={:.1} smooth={:.5} real={} lshare={:.3} {}", (rest - allowed) / explained, (rest-allowed)/ (allowed*(2.0/count).sqrt()), left.share*rest / explained, left.is_real(), left.share, v.join(" "));
     }
     if smooth > 0.0 || beyond > 0.0 {
         let ratio = smooth.max(beyond) / explained.max(1e-300);

@@ -106,6 +106,8 @@ pub struct BatteryBase {
     pub initial_soc_sigma: f64,
     /// Open-circuit voltage of the whole series string: state of charge (ascending) and V.
     pub ocv: Vec<(f64, f64)>,
+    /// Cells in series in what the voltage is of.
+    pub cells: f64,
     /// Ohmic resistance at 25 °C, in Ω, of the whole string.
     pub resistance_ohm: f64,
     /// Relative standard uncertainty of [`BatteryBase::resistance_ohm`]; 0: exact.

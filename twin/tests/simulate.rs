@@ -246,6 +246,7 @@ fn explaining_begins_where_simulating_ends() {
         efficiency: 0.99,
         initial_soc: vec![0.8],
         ocv: vec![(0.0, 3.0), (0.3, 3.5), (1.0, 4.1)],
+        cells: 1.0,
         resistance_ohm: 0.001,
         ..BatteryBase::default()
     };

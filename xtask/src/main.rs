@@ -74,6 +74,9 @@ enum Command {
         /// Begin no case after so many minutes; the next run goes on there
         #[arg(long, value_name = "N")]
         minutes: Option<u64>,
+        /// Other data of the same kinds: a number that is added to every seed
+        #[arg(long, value_name = "N")]
+        seeds: Option<u64>,
     },
     /// Run the release image on the emulated board (`--help` tells the arguments)
     #[command(disable_help_flag = true)]
@@ -133,8 +136,12 @@ fn run(command: &Command) -> Result<ExitCode> {
         } else {
             ExitCode::from(FAILED)
         }),
-        Command::Prove { quick, minutes } => {
-            prove::run(&workspace, *quick, *minutes)?;
+        Command::Prove {
+            quick,
+            minutes,
+            seeds,
+        } => {
+            prove::run(&workspace, *quick, *minutes, *seeds)?;
             Ok(ExitCode::SUCCESS)
         }
         Command::Emulate { arguments } => match emulate::run(&workspace, "drive", arguments)? {},

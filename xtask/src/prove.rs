@@ -10,7 +10,12 @@ use crate::{
 };
 
 /// The whole campaign into docs/proof, or its small part into target/prove/quick. Both go on where a broken run was.
-pub fn run(workspace: &Workspace, small: bool, minutes: Option<u64>) -> Result<()> {
+pub fn run(
+    workspace: &Workspace,
+    small: bool,
+    minutes: Option<u64>,
+    seeds: Option<u64>,
+) -> Result<()> {
     let python = python::proof_environment(workspace)?;
     apt::program(NGSPICE)?;
     let toolchain = toolchain::choose(workspace)?;
@@ -27,6 +32,9 @@ pub fn run(workspace: &Workspace, small: bool, minutes: Option<u64>) -> Result<(
     );
     if let Some(minutes) = minutes {
         prove.arg("--minutes").arg(minutes.to_string());
+    }
+    if let Some(seeds) = seeds {
+        prove.arg("--seeds").arg(seeds.to_string());
     }
     process::run(&mut prove)
 }

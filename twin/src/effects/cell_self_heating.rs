@@ -14,7 +14,7 @@ pub struct CellSelfHeating;
 static CARD: Card = Card {
     id: "cell-self-heating",
     statement: "Losses warm the cell, which lowers its resistance.",
-    equation: "T = T₀ + rth·LP(R(T₀)·i²), LP: first order with τ; R(T) with B of resistance-temperature, 2000 K without it",
+    equation: "T = T₀ + ΔT, τ·dΔT/dt + ΔT = rth·R(T)·i²; R(T) with B of resistance-temperature, 2000 K without it",
     parameters: &[
         Parameter::new("rth_k_per_w", "K/W", 0.0, Search::Smooth),
         Parameter::new("tau_s", "s", 300.0, Search::Logarithmic),
@@ -50,24 +50,32 @@ impl Effect for CellSelfHeating {
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
-        let (drive, steps) = (scene.drive, scene.steps.clone());
+        let drive = scene.drive;
         let Some(battery) = &mut scene.battery else {
             return;
         };
+        let (rth_k_per_w, tau_s) = (values[0], values[1]);
         let ohms = battery.base.resistance_ohm;
         let b_k = *battery.arrhenius_k.get_or_insert(USUAL_B_K);
-        // At the temperature that the cell would have without the warming: that lowers R by a few percent only.
-        let losses: Vec<f64> = scene
-            .signal
-            .iter()
-            .zip(&battery.temperature_c)
-            .map(|(i, t)| ohms * arrhenius(b_k, *t) * i * i)
-            .collect();
-        let heat = steps.ladder(&drive.segments, &losses, [values[1]], [1.0]);
-        battery
-            .temperature_c
-            .iter_mut()
-            .zip(heat)
-            .for_each(|(t, watts)| *t += values[0] * watts);
+        for rows in drive.segments.iter().filter(|rows| !rows.is_empty()) {
+            let mut warmer_k = 0.0;
+            let (mut step_s, mut kept) = (0.0, 1.0);
+            let times = drive.t_s[rows.clone()].windows(2);
+            let currents = scene.signal[rows.clone()].windows(2);
+            let around = &mut battery.temperature_c[rows.start..rows.end];
+            let mut before_c = around[0];
+            for ((times, pair), t) in times.zip(currents).zip(&mut around[1..]) {
+                let step = times[1] - times[0];
+                if step != step_s {
+                    (step_s, kept) = (step, (-step / tau_s).exp());
+                }
+                // The mean square of a current that goes in a straight line, at the temperature where the step begins.
+                let square = (pair[0] * pair[0] + pair[0] * pair[1] + pair[1] * pair[1]) / 3.0;
+                let loss_w = ohms * arrhenius(b_k, before_c + warmer_k) * square;
+                warmer_k = kept * warmer_k + (1.0 - kept) * rth_k_per_w * loss_w;
+                before_c = *t;
+                *t += warmer_k;
+            }
+        }
     }
 }

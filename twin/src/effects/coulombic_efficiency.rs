@@ -4,6 +4,12 @@ use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, counting};
 use crate::problem::Problem;
 
+/// What comes back at least: of lithium-ion cells 0.99 and more once they are formed, of lead–acid and nickel–metal hydride, charged
+/// to what they can be charged to on a drive, 0.9 and more (Linden's Handbook of Batteries). Less is a drift by another name.
+const LEAST: f64 = 0.9;
+/// No more comes back than was put in, but for what the instrument's two directions differ by.
+const MOST: f64 = 1.005;
+
 /// See [`CARD`].
 #[derive(Debug)]
 pub struct CoulombicEfficiency;
@@ -29,8 +35,7 @@ impl Effect for CoulombicEfficiency {
     }
 
     fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {
-        // More than comes back is noise.
-        (0.5, 1.02)
+        (LEAST, MOST)
     }
 
     fn starts(&self, _scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {

@@ -4,6 +4,9 @@ use super::scene::{REFERENCE_C, Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage};
 use crate::problem::{Problem, View};
 
+/// Largest of a cell, in V/K: lithium-ion cells lie within ±0.8 mV/K at any state of charge (Viswanathan 2010), others within ±2.
+const MOST_V_PER_K: f64 = 0.002;
+
 /// See [`CARD`].
 #[derive(Debug)]
 pub struct Entropic;
@@ -29,8 +32,9 @@ impl Effect for Entropic {
             && (problem.drive.cell_temperature_c.is_some() || problem.drive.ambient_c.is_some())
     }
 
-    fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {
-        (-0.02, 0.02)
+    fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
+        let most = MOST_V_PER_K * scale.cells;
+        (-most, most)
     }
 
     fn starts(&self, _scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {

@@ -4,6 +4,9 @@ use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, counting};
 use crate::problem::Problem;
 
+/// Hours in which the largest one empties the battery: a consumer that does so within a day is not overlooked.
+const HOURS: f64 = 24.0;
+
 /// See [`CARD`].
 #[derive(Debug)]
 pub struct ParasiticLoad;
@@ -29,7 +32,8 @@ impl Effect for ParasiticLoad {
     }
 
     fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
-        (-0.5 * scale.largest, 0.5 * scale.largest)
+        let most = scale.capacity_ah / HOURS;
+        (-most, most)
     }
 
     fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {

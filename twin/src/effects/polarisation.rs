@@ -1,7 +1,7 @@
 //! RC branches after the ohmic step.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+use super::{Card, Clues, Effect, IDEALISED, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
 /// One to three branches: one id, and as many parameters as branches need.
@@ -19,11 +19,11 @@ pub static THREE_BRANCHES: Polarisation = Polarisation { card: &CARDS[2] };
 
 static PARAMETERS: [Parameter; 6] = [
     Parameter::new("r1_ohm", "Ω", 0.0, Search::Linear),
-    Parameter::new("tau1_s", "s", 1.0, Search::Logarithmic),
+    Parameter::new("tau1_s", "s", 1.0, Search::Logarithmic).open(),
     Parameter::new("r2_ohm", "Ω", 0.0, Search::Linear),
-    Parameter::new("tau2_s", "s", 10.0, Search::Logarithmic),
+    Parameter::new("tau2_s", "s", 10.0, Search::Logarithmic).open(),
     Parameter::new("r3_ohm", "Ω", 0.0, Search::Linear),
-    Parameter::new("tau3_s", "s", 100.0, Search::Logarithmic),
+    Parameter::new("tau3_s", "s", 100.0, Search::Logarithmic).open(),
 ];
 
 static CARDS: [Card; 3] = [
@@ -74,6 +74,11 @@ impl Effect for Polarisation {
                 .map(|(a, b, c)| vec![r, taus[a], r, taus[b], r, taus[c]])
                 .to_vec(),
         }
+    }
+
+    /// Branches stand for a distributed process, whose resistance changes over a drive by some ten percent either way.
+    fn idealised(&self) -> f64 {
+        2.0 * IDEALISED
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

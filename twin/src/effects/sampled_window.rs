@@ -10,7 +10,7 @@ const ENOUGH: usize = 4000;
 /// Lines in the course of the delay that are followed: a load with a rhythm of its own has many beside the right one.
 const LINES: usize = 16;
 /// The best of them.
-const BEST: usize = 4;
+const BEST: usize = 6;
 /// Cycles that the age of a reading goes through in a recording at least: with fewer it is a delay.
 const CYCLES: f64 = 6.0;
 
@@ -79,6 +79,11 @@ impl Effect for SampledWindow {
         starts
     }
 
+    fn choices(&self, scale: &Scale) -> f64 {
+        // Two a cycle of the beat that is resolved, up to one in two rows.
+        (scale.span_s / scale.even_s.max(1e-12)).max(1.0)
+    }
+
     fn near(&self, values: &[f64], scale: &Scale, share: f64) -> Option<Vec<Vec<f64>>> {
         let (period, duty, phase) = (values[0], values[1], values[2]);
         let span = scale.span_s.max(period);
@@ -94,8 +99,8 @@ impl Effect for SampledWindow {
             // All windows.
             [0.0, 0.0, 2.0 * period],
             // Where windows begin, and where they end.
-            [0.0, duty, -duty * period],
-            [0.0, duty, 0.0],
+            [0.0, 1.0, -period],
+            [0.0, 1.0, 0.0],
         ]
         .into_iter()
         .flat_map(along)
@@ -241,7 +246,8 @@ fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
         let age = phase.rem_euclid(1.0);
         // The beat is the period's rate less a whole number of times that of the rows.
         let nearest = ((1.0 / period - beat) * step).round();
-        for turns in [nearest - 1.0, nearest, nearest + 1.0] {
+        // Of windows of some rows the course tells the beat only.
+        for turns in [nearest - 1.0, nearest, nearest + 1.0, 0.0, 1.0, 2.0] {
             let rate = beat + turns / step;
             if rate > 0.0 && 1.0 / rate < 0.1 * span && late_s > 0.0 {
                 starts.push(seen(1.0 / rate, late_s, age));

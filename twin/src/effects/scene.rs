@@ -39,6 +39,8 @@ pub struct Scale {
     pub capacity_ah: f64,
     /// Ohmic resistance by design in Ω.
     pub resistance_ohm: f64,
+    /// Cells in series, 0 without a battery.
+    pub cells: f64,
     /// Averaging window by design in s.
     pub window_s: f64,
     /// The converter's step by design.
@@ -711,12 +713,16 @@ impl<'a> Battery<'a> {
     pub fn count(&mut self, drive: &Drive, current_a: &[f64]) {
         let mut soc = vec![0.0; drive.len()];
         let per_as = 1.0 / (3600.0 * self.capacity_ah);
-        let flow = |current: f64| {
-            if current < 0.0 {
-                current * self.efficiency
-            } else {
-                current
-            }
+        // Mean of a current that goes in a straight line, the part of it that charges times the efficiency.
+        let lost = 1.0 - self.efficiency;
+        let flow = |from: f64, to: f64| {
+            let charging = match (from < 0.0, to < 0.0) {
+                (true, true) => 0.5 * (from + to),
+                (true, false) => 0.5 * from * from / (from - to),
+                (false, true) => 0.5 * to * to / (to - from),
+                (false, false) => 0.0,
+            };
+            0.5 * (from + to) - lost * charging
         };
         for (index, rows) in drive
             .segments
@@ -726,18 +732,13 @@ impl<'a> Battery<'a> {
         {
             let first = self.base.initial_soc.get(index).copied().unwrap_or(1.0) + self.soc_shift;
             soc[rows.start] = first;
-            let (mut last, mut before) = (first, flow(current_a[rows.start]));
+            let mut last = first;
             let after = rows.start + 1..rows.end;
             let steps = drive.t_s[rows.clone()].windows(2);
-            for ((soc, current), times) in soc[after.clone()]
-                .iter_mut()
-                .zip(&current_a[after])
-                .zip(steps)
-            {
-                let here = flow(*current);
-                let mean = 0.5 * (here + before);
-                last -= mean * (times[1] - times[0]) * per_as;
-                (*soc, before) = (last, here);
+            let pairs = current_a[rows.clone()].windows(2);
+            for ((soc, pair), times) in soc[after].iter_mut().zip(pairs).zip(steps) {
+                last -= flow(pair[0], pair[1]) * (times[1] - times[0]) * per_as;
+                *soc = last;
             }
         }
         self.soc = soc.into();
@@ -778,7 +779,7 @@ pub fn arrhenius(b_k: f64, temperature_c: f64) -> f64 {
 }
 
 /// Straight lines between the points of the table and beyond its ends.
-fn open_circuit_v(table: &[(f64, f64)], soc: &[f64]) -> Vec<f64> {
+pub fn open_circuit_v(table: &[(f64, f64)], soc: &[f64]) -> Vec<f64> {
     match table {
         [] => vec![0.0; soc.len()],
         [only] => vec![only.1; soc.len()],

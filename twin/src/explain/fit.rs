@@ -21,6 +21,12 @@ const SLOW: f64 = 5e-3;
 const ENOUGH: f64 = 1e-4;
 /// How far away values without a slope are tried.
 const SHARES: [f64; 8] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5];
+/// The same for values that are moved together.
+const TOGETHER: [f64; 7] = [0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4];
+
+/// What the model file says of the base is off by this many of its own standard uncertainties at most: beyond them it is no
+/// uncertainty but physics that was left out, and has a name.
+const BASE_OFF: f64 = 4.0;
 
 /// A fit of more rows than this does not keep its slope: memory stays linear in the recording, with a small factor.
 const KEPT_ROWS: usize = 40_000;
@@ -226,6 +232,24 @@ impl Slope {
     }
 }
 
+/// Standard uncertainties of the base: of the initial state of charge, and of the resistance as a share of it.
+fn base_sigmas(bench: &Workbench<'_>) -> Option<(f64, f64)> {
+    match &bench.problem.base {
+        Base::Battery(base) => Some((base.initial_soc_sigma, base.resistance_sigma)),
+        Base::Sensor(_) => None,
+    }
+}
+
+/// Whether a value of the base stands where its uncertainty ends, and the residual would have it beyond: it is free no more, and
+/// hides nothing that an effect explains.
+fn ended(column: &[f64], prior: f64, at: f64, residual: &[f64]) -> bool {
+    if prior <= 0.0 || at.abs() * prior.sqrt() < BASE_OFF * (1.0 - 1e-9) {
+        return false;
+    }
+    let sigma = spread(residual);
+    (dot(column, residual) / (sigma * sigma) - prior * at) * at > 0.0
+}
+
 fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta: f64) {
     match coordinate {
         Coordinate::Value(member, parameter, logarithmic) => {
@@ -240,10 +264,15 @@ fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta
             *value = value.clamp(low.min(high), high.max(low));
         }
         Coordinate::SocShift => {
-            model.nuisance.soc_shift = (model.nuisance.soc_shift + delta).clamp(-1.0, 1.0)
+            let most = base_sigmas(bench)
+                .map_or(1.0, |(soc, _)| BASE_OFF * soc)
+                .min(1.0);
+            model.nuisance.soc_shift = (model.nuisance.soc_shift + delta).clamp(-most, most);
         }
         Coordinate::Resistance => {
-            model.nuisance.resistance = (model.nuisance.resistance + delta).clamp(-0.9, 5.0);
+            let most = base_sigmas(bench).map_or(5.0, |(_, resistance)| BASE_OFF * resistance);
+            let resistance = model.nuisance.resistance + delta;
+            model.nuisance.resistance = resistance.clamp((-most).max(-0.9), most);
         }
         Coordinate::Alignment => {
             let most = 0.6 * bench.scale.step_s.max(bench.scale.reading_step_s);
@@ -359,8 +388,11 @@ fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
             columns[k] = any.then_some(column);
         }
     }
+    let residual = bench.residual(predicted);
     for ((coordinate, _, prior, at), column) in coordinates.into_iter().zip(columns) {
-        if let Some(column) = column {
+        if let Some(column) = column
+            && !ended(&column, prior, at, &residual)
+        {
             slope.coordinates.push(coordinate);
             slope.columns.push(column);
             slope.prior.push(prior);
@@ -651,8 +683,8 @@ fn search_steps(
     for m in 0..model.members.len() {
         let effect = model.members[m].effect;
         // Where values depend on one another they are moved together.
-        for share in SHARES {
-            for _ in 0..4 {
+        for share in TOGETHER {
+            for _ in 0..10 {
                 let Some(near) = effect.near(&model.members[m].values, &bench.scale, share) else {
                     break;
                 };
@@ -663,6 +695,11 @@ fn search_steps(
                         *value = value.clamp(low, high);
                     }
                     let mut moved = model.clone();
+                    if let Some((held, p)) = model.held
+                        && held == m
+                    {
+                        values[p] = model.members[m].values[p];
+                    }
                     moved.members[m].values = values;
                     let there_predicted = bench.run(&moved);
                     let there_residual = bench.residual(&there_predicted);

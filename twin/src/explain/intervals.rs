@@ -105,6 +105,7 @@ fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope) -> Certainty {
     let weights = weights(&fit.residual, fit.sigma);
     let parts = parts(bench, fit, slope, &weights);
     let (whole, right) = sum(slope, &parts);
+    let stated = slope.prior().0;
     // What the whole would still step is no spread.
     let rest = solve(&whole, &right, 1e-9);
     let count = parts.len() as f64;
@@ -152,12 +153,16 @@ fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope) -> Certainty {
             .collect();
         let white = variance * influence.iter().map(|a| a * a).sum::<f64>();
         let by_noise = bench.carried(0, &influence).unwrap_or(white);
+        // What the model file says of the base is as uncertain as it says.
+        let by_base: f64 = (0..size)
+            .map(|j| inverted[(k, j)].powi(2) * stated[(j, j)])
+            .sum();
         let (sum, squares) = told[k];
         let freedom = (sum * sum / squares.max(1e-300)).min(count - 1.0);
-        let mut most = NORMAL * by_noise.sqrt();
+        let mut most = NORMAL * (by_noise + by_base).sqrt();
         let mut times = by_noise / white.max(1e-300);
         if freedom >= LEAST_FREEDOM {
-            most = most.max(student(freedom) * by_stretches[k].sqrt());
+            most = most.max(student(freedom) * (by_stretches[k] + by_base).sqrt());
             times = times.max(by_stretches[k] / white.max(1e-300));
         }
         half.push(most);

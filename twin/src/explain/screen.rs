@@ -12,7 +12,7 @@ use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 use rayon::prelude::*;
 use rustfft::{Fft, FftPlanner, num_complex::Complex};
 
-use super::fit::{Fit, Solver, TUNING, dot, normal, spread};
+use super::fit::{Fit, Solver, TUNING, dot, huber, normal, spread};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search};
 
@@ -30,10 +30,27 @@ pub struct Entry {
     pub member: Member,
     /// Squared error that it removes from held-out blocks, as a share of all of it.
     pub gain: f64,
+    /// Loss of the simulation with these very values.
+    pub loss: f64,
     columns: Vec<Vec<f64>>,
     folds: Folds,
     /// Products of the columns with the residual, block by block.
     rights: Vec<f64>,
+}
+
+impl Entry {
+    /// Whether all of its values are searched in steps.
+    pub fn fixed(&self) -> bool {
+        stepped(self.member.effect)
+    }
+}
+
+fn stepped(effect: &dyn Effect) -> bool {
+    effect
+        .card()
+        .parameters
+        .iter()
+        .all(|parameter| parameter.search == Search::Stepped)
 }
 
 /// What screening a residual gives.
@@ -78,6 +95,7 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
         .into_iter()
         .map(|r| r.clamp(-limit, limit))
         .collect();
+    let whole = take(&fit.residual);
     let own: Vec<Vec<f64>> = fit
         .slope(bench)
         .columns
@@ -118,6 +136,7 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
         .into_par_iter()
         .filter_map(|(effect, values)| {
             let base = replaced(&fit.model, effect);
+            let mut loss = 0.0;
             let columns: Vec<Vec<f64>> = probes(effect, &values)
                 .into_iter()
                 .filter_map(|probe| {
@@ -133,6 +152,11 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
                             if change.is_finite() { change } else { 0.0 }
                         })
                         .collect();
+                    loss = whole
+                        .iter()
+                        .zip(&raw)
+                        .map(|(residual, change)| huber((residual - change) / sigma))
+                        .sum();
                     let before = dot(&raw, &raw);
                     let column = clean(raw);
                     // What the model can do by itself is no signature.
@@ -161,6 +185,7 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
             let entry = Entry {
                 member: Member { effect, values },
                 gain: folds.gain(&rights) / all,
+                loss,
                 columns,
                 folds,
                 rights,

@@ -41,6 +41,8 @@ const SMALL: f64 = 0.2;
 const STRETCHES: usize = 200;
 /// A model is beaten if another's held-out loss is lower by this many standard errors of their paired difference.
 const BEATEN: f64 = 2.0;
+/// The best of many choices counts from where noise would reach once in so many recordings.
+const CHANCE: f64 = 1e-3;
 /// An effect would do as well as another if it takes at least this share of what that one takes.
 const EQUAL: f64 = 0.5;
 
@@ -100,7 +102,18 @@ impl Selection {
 
 /// Held-out loss of a fit by row, and in all.
 fn losses(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> (Vec<f64>, f64) {
-    let rows = held_out(bench, fit, sigma).concat();
+    let mut rows = held_out(bench, fit, sigma).concat();
+    // The best of many independent choices fits noise by the logarithm of their number, and no block held out shows it.
+    let chance: f64 = fit
+        .model
+        .members
+        .iter()
+        .map(|member| member.effect.choices(&bench.scale))
+        .filter(|choices| *choices > 1.0)
+        .map(|choices| (choices / CHANCE).ln())
+        .sum();
+    let each = chance / rows.len().max(1) as f64;
+    rows.iter_mut().for_each(|loss| *loss += each);
     let all = rows.iter().sum();
     (rows, all)
 }
@@ -304,16 +317,27 @@ fn fits(
     most: usize,
     starts: usize,
 ) -> Vec<(Fit, f64)> {
-    let mut chosen: Vec<&Entry> = Vec::new();
-    let mut effects: Vec<(&'static str, usize, usize)> = Vec::new();
-    for entry in entries.iter().filter(|entry| !endless(bench, &entry.member)) {
-        let key = (entry.member.id(), entry.member.values.len());
-        match effects.iter().position(|(id, size, _)| (*id, *size) == key) {
-            Some(at) if effects[at].2 < starts => effects[at].2 += 1,
-            None if effects.len() < most => effects.push((key.0, key.1, 1)),
-            _ => continue,
+    let mut effects: Vec<Vec<&Entry>> = Vec::new();
+    for entry in entries
+        .iter()
+        .filter(|entry| !endless(bench, &entry.member))
+    {
+        let key = |entry: &Entry| (entry.member.id(), entry.member.values.len());
+        let known = effects.iter().position(|of| key(of[0]) == key(entry));
+        match known {
+            Some(at) => effects[at].push(entry),
+            None if effects.len() < most => effects.push(vec![entry]),
+            None => (),
         }
-        chosen.push(entry);
+    }
+    let mut chosen: Vec<&Entry> = Vec::new();
+    for mut of in effects {
+        // Where the size is not free, nothing but the start itself says how good it is.
+        if of[0].fixed() {
+            of.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+        }
+        of.truncate(starts);
+        chosen.extend(of);
     }
     chosen
         .into_par_iter()
@@ -401,17 +425,16 @@ fn obstacle(
     index: usize,
     gain: f64,
 ) -> Option<String> {
-    hindrance(bench, before, after, index, gain, false)
+    small(bench, before, after, index, gain).or_else(|| at_end(bench, &after.model.members[index]))
 }
 
-/// The same; an equal of another effect may be what that one is by a value beyond what the recording tells.
-fn hindrance(
+/// The first two of these.
+fn small(
     bench: &Workbench<'_>,
     before: &Fit,
     after: &Fit,
     index: usize,
     gain: f64,
-    equal: bool,
 ) -> Option<String> {
     let member = &after.model.members[index];
     let card = member.effect.card();
@@ -442,7 +465,11 @@ fn hindrance(
         ));
     }
     let beside = beside(bench, after, index);
-    let all: f64 = change.iter().map(|c| c * c).sum();
+    let mut all: f64 = change.iter().map(|c| c * c).sum();
+    if before.model.members.len() < after.model.members.len() {
+        // What the others would do in its place is theirs.
+        all = all.min(apart(before, after));
+    }
     if all < beside {
         return Some(format!(
             "{:.2} rms, which the equations of the others may be off by ({:.2})",
@@ -473,6 +500,12 @@ fn hindrance(
             f64::sqrt(accuracy / rows)
         ));
     }
+    None
+}
+
+/// What of an effect's values would be at the end of what is physics.
+pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
+    let card = member.effect.card();
     for (p, parameter) in card
         .parameters
         .iter()
@@ -482,7 +515,7 @@ fn hindrance(
         let (low, high) = member.effect.bounds(p, &bench.scale);
         let value = member.values[p];
         let endless = member.effect.endless(p, &bench.scale);
-        if value >= endless && !equal {
+        if value >= endless {
             return Some(format!(
                 "{} would be {value:.4}, more than the recording tells",
                 parameter.name
@@ -490,6 +523,7 @@ fn hindrance(
         }
         let margin = match parameter.search {
             Search::Logarithmic => value * 0.01,
+            Search::Stepped if low > 0.0 => value * 0.01,
             _ => 1e-4 * (high - low),
         };
         let end = if value <= low + margin {
@@ -514,10 +548,18 @@ fn hindrance(
     None
 }
 
-/// Energy by which the other effects' equations may be off.
+/// Energy by which two models' simulations are apart.
+fn apart(one: &Fit, other: &Fit) -> f64 {
+    change(&one.predicted, &other.predicted)
+        .iter()
+        .map(|change| change * change)
+        .sum()
+}
+
+/// Energy by which the other effects' equations may be off, those of the model file among them.
 fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
     let members = &fit.model.members;
-    (0..members.len())
+    let others: f64 = (0..members.len())
         .filter(|other| *other != index)
         .map(|other| {
             let share = members[other].effect.idealised();
@@ -534,7 +576,8 @@ fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
                 .sum();
             share * share * energy
         })
-        .sum()
+        .sum();
+    bench.modelled + others
 }
 
 /// Two effects that hide each other: neither passes alone, both together do.
@@ -803,7 +846,9 @@ fn plainer(
                 .map(|(_, fit)| fit)
                 .filter(|fit| {
                     fit.model.members.last().is_some_and(|member| {
-                        exact(member) && one.equivalent.contains(&member.id())
+                        exact(member)
+                            && one.equivalent.contains(&member.id())
+                            && at_end(bench, member).is_none()
                     }) && !beaten(bench, fit, now)
                 })
                 .min_by(|a, b| a.cost.total_cmp(&b.cost))
@@ -825,14 +870,17 @@ fn name(
             let taken = share(bench, &without, now);
             // Where few rows decide, the difference of two models is never certain: who takes much less is no equal.
             let least = (EQUAL * taken).max(p99_of(step_p99, id));
+            let beside = beside(bench, now, index);
             let mut equivalent: Vec<&'static str> = others
                 .iter()
                 .filter(|(at, _)| *at == index)
                 .filter(|(_, other)| {
                     let last = other.model.members.len() - 1;
                     share(bench, &without, other) >= least
-                        && !beaten(bench, other, now)
-                        && hindrance(bench, &without, other, last, 1.0, true).is_none()
+                        // What the other effects' equations may be off by does not decide between two.
+                        && (apart(now, other) < beside || !beaten(bench, other, now))
+                        // At the end of what is physics it cannot be named, and speaks against another's being certain.
+                        && small(bench, &without, other, last, 1.0).is_none()
                 })
                 .filter_map(|(_, other)| other.model.members.last().map(Member::id))
                 .collect();

@@ -10,7 +10,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 
 use crate::effects::chain::{Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
-use crate::effects::{Clues, Effect, LIBRARY, Parameter, Stage};
+use crate::effects::{Clues, Effect, LIBRARY, Parameter, Stage, find_with};
 use crate::problem::{Base, Problem, View};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row).
@@ -105,6 +105,8 @@ pub struct Workbench<'a> {
     pub blocks: Vec<Range<usize>>,
     /// Effects that may be named.
     pub library: Vec<&'static dyn Effect>,
+    /// Energy by which the equations of the effects that the model file has may be off.
+    pub modelled: f64,
     /// Fits that were made: from which model to which, with spread and loss.
     known: Mutex<HashMap<Key, (Model, f64, f64)>>,
 }
@@ -171,10 +173,26 @@ impl<'a> Workbench<'a> {
                     && !problem.modelled.iter().any(|(known, _)| *known == id)
             })
             .collect();
+        let modelled = (0..problem.modelled.len())
+            .map(|index| {
+                let (id, values) = &problem.modelled[index];
+                let share = find_with(id, values.len()).map_or(0.0, |effect| effect.idealised());
+                let mut without = problem.clone();
+                without.modelled.remove(index);
+                let without = Chain::new(&without).run(&[], Nuisance::default());
+                let energy: f64 = rows
+                    .iter()
+                    .map(|&row| (all[row] - without[row]).powi(2))
+                    .filter(|change| change.is_finite())
+                    .sum();
+                share * share * energy
+            })
+            .sum();
         Self {
             problem,
             chain,
             scale,
+            modelled,
             rows,
             t_s,
             y,
@@ -423,6 +441,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         Base::Battery(base) => {
             scale.capacity_ah = base.capacity_ah;
             scale.resistance_ohm = base.resistance_ohm;
+            scale.cells = base.cells;
         }
     }
     scale

@@ -88,6 +88,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             initial_soc: Vec::new(),
             initial_soc_sigma: battery.initial_soc_uncertainty,
             ocv,
+            cells,
             resistance_ohm: battery.resistance_ohm * cells,
             resistance_sigma: battery.resistance_uncertainty,
         };
