@@ -52,8 +52,11 @@ const TRACES: f64 = 0.05;
 /// not what is there: true ones of other people's cells, whose equations are rough, stay below.
 const WAVERS: f64 = 0.02;
 /// From this share on (5 % rms, as much as an idealised equation may be off) the name is doubted: another physics of much the same
-/// shape could be behind it. The same where so much of what the effects take is left within reach of the inputs.
+/// shape could be behind it. The same where so much of what the effects take is left within reach of the inputs, or beyond the
+/// stated noise.
 const DOUBTED: f64 = 0.0025;
+/// What is left has to have this many times the energy of the stated noise to be beyond it: noise is stated to five percent at best.
+const STATED: f64 = 1.1;
 /// An effect that makes the error in another file larger by this factor is not that file's physics.
 const WORSE: f64 = 1.05;
 /// A file that was never fitted confirms the effects if they bring its error down to this share.
@@ -206,7 +209,14 @@ fn one(
         left,
         options.seed,
     );
-    let (verdict, doubted) = doubt(&bench, &mut selection, verdict, left, confirmed, taken_back);
+    let (verdict, doubted) = doubt(
+        &bench,
+        &mut selection,
+        verdict,
+        left,
+        (confirmed, taken_back),
+        options.seed,
+    );
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);
@@ -622,35 +632,6 @@ fn judge(
             short((rest / unavoidable).sqrt())
         ));
     }
-    if std::env::var("TWIN_DEBUG").is_ok() {
-        let v: Vec<String> = intervals::variations(bench, &selection.fit)
-            .iter()
-            .enumerate()
-            .map(|(m, v)| {
-                let without = bench.run(&selection.fit.model.without(m));
-                let own: f64 = fit::change(&selection.fit.predicted, &without)
-                    .iter()
-                    .map(|c| c * c)
-                    .sum();
-                format!(
-                    "{}:dev={:.1},h={:.5},own={:.3}",
-                    selection.fit.model.members[m].id(),
-                    v.deviations,
-                    v.share,
-                    own / explained
-                )
-            })
-            .collect();
-        eprintln!(
-            "DEBUG excess={:.5} z={:.1} smooth={:.5} real={} lshare={:.3} {}",
-            (rest - allowed) / explained,
-            (rest - allowed) / (allowed * (2.0 / count).sqrt()),
-            left.share * rest / explained,
-            left.is_real(),
-            left.share,
-            v.join(" ")
-        );
-    }
     if smooth > 0.0 || beyond > 0.0 {
         let ratio = smooth.max(beyond) / explained.max(1e-300);
         let change = fit::change(&selection.fit.predicted, &selection.plain.predicted);
@@ -682,6 +663,12 @@ fn judge(
     }
 }
 
+/// The least energy that the design lets be left: what is unavoidable, or the reference's own zero.
+fn stated(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
+    let zero = bench.problem.accuracy.zero;
+    unavoidable(bench, fit, seed).max(zero * zero * bench.len() as f64)
+}
+
 /// The verdict once more: names whose values waver, or that leave what follows the inputs, are the best of the library and no
 /// more; and where all names were taken back for that, the mismatch is still there. True if names are doubted.
 fn doubt(
@@ -689,8 +676,8 @@ fn doubt(
     selection: &mut Selection,
     verdict: Verdict,
     left: Explainable,
-    confirmed: bool,
-    taken_back: bool,
+    (confirmed, taken_back): (bool, bool),
+    seed: u64,
 ) -> (Verdict, bool) {
     if taken_back && verdict == Verdict::NoMismatch {
         selection.decisions.push(
@@ -704,7 +691,17 @@ fn doubt(
     }
     let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
     let rest = energy(&selection.fit);
-    let reach = left.share * rest / (energy(&selection.plain) - rest).max(1e-300);
+    let explained = (energy(&selection.plain) - rest).max(1e-300);
+    let allowed = stated(bench, &selection.fit, seed);
+    // What is left beyond the stated noise, if that is stated well enough.
+    let deviation = allowed * (2.0 / bench.len().max(1) as f64).sqrt();
+    let certain = rest > STATED * allowed && rest - allowed > select::CERTAIN * deviation;
+    let beyond = if bench.problem.noise > 0.0 && certain {
+        (rest - allowed) / explained
+    } else {
+        0.0
+    };
+    let reach = left.share * rest / explained;
     let wavers = intervals::variations(bench, &selection.fit)
         .into_iter()
         .filter(|variation| variation.deviations > select::CERTAIN)
@@ -720,6 +717,12 @@ fn doubt(
             format!(
                 "what is left within reach of the inputs is {} of its change",
                 percent(reach.sqrt())
+            )
+        }),
+        (beyond > DOUBTED).then(|| {
+            format!(
+                "what is left beyond the stated noise is {} of its change",
+                percent(beyond.sqrt())
             )
         }),
     ];

@@ -306,6 +306,12 @@ fn missed(bench: &Workbench<'_>, mut now: Fit) -> Fit {
     now
 }
 
+/// Whether a value is so far beyond what the recording tells that the effect does what a simpler one does.
+fn endless(bench: &Workbench<'_>, member: &Member) -> bool {
+    let mut values = member.values.iter().enumerate();
+    values.any(|(p, value)| *value >= member.effect.endless(p, &bench.scale))
+}
+
 /// Fits the most promising entries in place of nothing.
 fn fits(
     bench: &Workbench<'_>,
@@ -315,7 +321,10 @@ fn fits(
     starts: usize,
 ) -> Vec<(Fit, f64)> {
     let mut effects: Vec<Vec<&Entry>> = Vec::new();
-    for entry in entries {
+    for entry in entries
+        .iter()
+        .filter(|entry| !endless(bench, &entry.member))
+    {
         let key = |entry: &Entry| (entry.member.id(), entry.member.values.len());
         let known = effects.iter().position(|of| key(of[0]) == key(entry));
         match known {
