@@ -186,7 +186,31 @@ struct New<'a> {
     options: Map<String, Value>,
 }
 
-impl New<'_> {
+impl<'a> New<'a> {
+    /// With what most cases of the sensing chain have.
+    fn sensing(group: Group, effects: &'a [&'a str]) -> Self {
+        Self {
+            group,
+            maker: "sensing",
+            effects,
+            strength: 10.0,
+            noise: "white",
+            drive: "us06",
+            seed: 1,
+            rows: ROWS,
+            options: Map::new(),
+        }
+    }
+
+    /// The same of a cell.
+    fn battery(group: Group, effects: &'a [&'a str]) -> Self {
+        Self {
+            maker: "battery",
+            rows: BATTERY_ROWS,
+            ..Self::sensing(group, effects)
+        }
+    }
+
     fn planned(self) -> Planned {
         let effects: Vec<Concealed> = self
             .effects
@@ -534,15 +558,11 @@ fn combined() -> Vec<Planned> {
         ] {
             plan.push(
                 New {
-                    group: Group::Combined,
-                    maker: "sensing",
-                    effects,
                     strength,
                     noise,
                     drive,
-                    seed: 1,
-                    rows: ROWS,
                     options: options(json!({ "masked": true })),
+                    ..New::sensing(Group::Combined, effects)
                 }
                 .planned(),
             );
@@ -552,15 +572,9 @@ fn combined() -> Vec<Planned> {
         for drive in CELL_DRIVES {
             plan.push(
                 New {
-                    group: Group::Combined,
-                    maker: "battery",
-                    effects,
-                    strength: 10.0,
-                    noise: "white",
                     drive,
-                    seed: 1,
-                    rows: BATTERY_ROWS,
                     options: options(json!({ "masked": true })),
+                    ..New::battery(Group::Combined, effects)
                 }
                 .planned(),
             );
@@ -575,15 +589,11 @@ fn clean() -> Vec<Planned> {
         for drive in DRIVES {
             for seed in 1..=12 {
                 let mut planned = New {
-                    group: Group::Clean,
-                    maker: "sensing",
-                    effects: &[],
                     strength: f64::INFINITY,
                     noise,
                     drive,
                     seed,
-                    rows: ROWS,
-                    options: Map::new(),
+                    ..New::sensing(Group::Clean, &[])
                 }
                 .planned();
                 if seed == 1 {
@@ -596,15 +606,11 @@ fn clean() -> Vec<Planned> {
             for seed in 1..=5 {
                 plan.push(
                     New {
-                        group: Group::Clean,
-                        maker: "battery",
-                        effects: &[],
                         strength: f64::INFINITY,
                         noise,
                         drive,
                         seed,
-                        rows: BATTERY_ROWS,
-                        options: Map::new(),
+                        ..New::battery(Group::Clean, &[])
                     }
                     .planned(),
                 );
@@ -620,15 +626,8 @@ fn outside() -> Vec<Planned> {
         for drive in CELL_DRIVES {
             plan.push(
                 New {
-                    group: Group::Outside,
-                    maker: "battery",
-                    effects: &[effect],
-                    strength: 10.0,
-                    noise: "white",
                     drive,
-                    seed: 1,
-                    rows: BATTERY_ROWS,
-                    options: Map::new(),
+                    ..New::battery(Group::Outside, &[effect])
                 }
                 .planned(),
             );
@@ -644,15 +643,10 @@ fn outside() -> Vec<Planned> {
         ] {
             plan.push(
                 New {
-                    group: Group::Outside,
-                    maker: "sensing",
-                    effects: &[effect],
                     strength,
                     noise,
                     drive,
-                    seed: 1,
-                    rows: ROWS,
-                    options: Map::new(),
+                    ..New::sensing(Group::Outside, &[effect])
                 }
                 .planned(),
             );
@@ -667,15 +661,9 @@ fn inseparable() -> Vec<Planned> {
         for drive in ["us06", "hwfet"] {
             plan.push(
                 New {
-                    group: Group::Inseparable,
-                    maker: "sensing",
-                    effects: &[effect],
-                    strength: 10.0,
-                    noise: "white",
                     drive,
-                    seed: 1,
-                    rows: ROWS,
                     options: options(json!({ "constant": [still] })),
+                    ..New::sensing(Group::Inseparable, &[effect])
                 }
                 .planned(),
             );
@@ -684,15 +672,8 @@ fn inseparable() -> Vec<Planned> {
     for drive in CELL_DRIVES {
         plan.push(
             New {
-                group: Group::Inseparable,
-                maker: "battery",
-                effects: &["offset"],
-                strength: 10.0,
-                noise: "white",
                 drive,
-                seed: 1,
-                rows: BATTERY_ROWS,
-                options: Map::new(),
+                ..New::battery(Group::Inseparable, &["offset"])
             }
             .planned(),
         );
@@ -700,15 +681,8 @@ fn inseparable() -> Vec<Planned> {
     for effect in ["gain", "core-saturation"] {
         plan.push(
             New {
-                group: Group::Inseparable,
-                maker: "sensing",
-                effects: &[effect],
-                strength: 10.0,
-                noise: "white",
                 drive: "square",
-                seed: 1,
-                rows: ROWS,
-                options: Map::new(),
+                ..New::sensing(Group::Inseparable, &[effect])
             }
             .planned(),
         );

@@ -106,11 +106,11 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
         );
         holdouts.push(Holdout {
             file: file.clone(),
-            problems: other.problems(),
+            problems: other.into_problems(),
         });
     }
     drop(reading);
-    let problems = prepared.problems();
+    let problems = prepared.into_problems();
     let mut explaining = Progress::new(format!("explaining {}", arguments.recording.display()));
     let options = Options {
         without: arguments.without.clone(),

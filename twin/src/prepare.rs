@@ -107,8 +107,8 @@ pub struct Prepared {
 
 impl Prepared {
     /// The problems alone.
-    pub fn problems(&self) -> Vec<Problem> {
-        self.items.iter().map(|item| item.problem.clone()).collect()
+    pub fn into_problems(self) -> Vec<Problem> {
+        self.items.into_iter().map(|item| item.problem).collect()
     }
 }
 
