@@ -278,7 +278,9 @@ fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta
             *value = value.clamp(low.min(high), high.max(low));
         }
         Coordinate::SocShift => {
-            let most = base_sigmas(bench).map_or(1.0, |(soc, _)| BASE_OFF * soc).min(1.0);
+            let most = base_sigmas(bench)
+                .map_or(1.0, |(soc, _)| BASE_OFF * soc)
+                .min(1.0);
             model.nuisance.soc_shift = (model.nuisance.soc_shift + delta).clamp(-most, most);
         }
         Coordinate::Resistance => {

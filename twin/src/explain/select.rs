@@ -393,8 +393,7 @@ fn obstacle(
     index: usize,
     gain: f64,
 ) -> Option<String> {
-    small(bench, before, after, index, gain)
-        .or_else(|| at_end(bench, &after.model.members[index]))
+    small(bench, before, after, index, gain).or_else(|| at_end(bench, &after.model.members[index]))
 }
 
 /// The first two of these.
