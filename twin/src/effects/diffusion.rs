@@ -5,7 +5,7 @@ use super::{Card, Clues, Effect, IDEALISED, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
 /// Terms of the series that are calculated.
-const TERMS: usize = 9;
+const TERMS: usize = 8;
 /// State of charge between which the mean slope of the open-circuit voltage is taken: the ends of the curve are steep.
 const MIDDLE: (f64, f64) = (0.2, 0.8);
 /// Share by which the straight law may be off: the slope of the open-circuit voltage, which makes concentration into voltage, changes
