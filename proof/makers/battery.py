@@ -39,6 +39,9 @@ CELLS_ACROSS, GROWTH = 30, 1.18
 """Finite volumes of the diffusion, each thicker than the one before it."""
 REMEMBERED = 32
 TEMPERATURE_NOISE_K = 0.05
+LEAST_EFFICIENCY = 0.9
+"""A cell that is in use gives back more of its charge: lithium-ion 0.99 and more, lead–acid and nickel–metal hydride, not charged to
+the brim, 0.9 and more (Linden's Handbook of Batteries). A drive that hardly charges asks for less, below 0 at the end."""
 SOC_UNCERTAINTY, RESISTANCE_UNCERTAINTY = 0.005, 0.03
 
 Values = dict[str, float]
@@ -326,6 +329,8 @@ class Conceal:
         drawn = sign(self.random)
         size = scaled(lambda size: rms(self.change(effect, values(size, drawn))), FIRST_SIZE[effect], visible_v(strength), effect)
         choices = [drawn] if before is None or effect not in SIGNED else [-1.0, 1.0]
+        if effect == "coulombic-efficiency" and values(size, drawn)["efficiency"] < LEAST_EFFICIENCY:
+            raise RuntimeError(f"{effect}: {1e3 * visible_v(strength):.3g} mV is out of its reach, no cell loses {size:.2g} of its charge")
         changes = [self.change(effect, values(size, choice)) for choice in choices]
         best = int(np.argmin([rms(change if before is None else before + change) for change in changes]))
         return values(size, choices[best]), changes[best]

@@ -633,7 +633,8 @@ fn judge(
         ));
     }
     if smooth > 0.0 || beyond > 0.0 {
-        let ratio = smooth.max(beyond) / explained.max(1e-300);
+        // What the model file's own equations may be off by is no sign of another physics.
+        let ratio = (smooth.max(beyond) - bench.modelled).max(0.0) / explained.max(1e-300);
         let change = fit::change(&selection.fit.predicted, &selection.plain.predicted);
         let (shape, change) = features.shape(&selection.fit.residual, &change);
         let alike = if smooth > 0.0 {

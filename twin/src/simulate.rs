@@ -52,12 +52,18 @@ fn battery(base: &BatteryBase, drive: &Drive, observed: &Observed, view: View) -
         let mut soc = base.initial_soc.get(index).copied().unwrap_or(1.0);
         for row in rows.clone() {
             if row > rows.start {
-                let flow = |row: usize| {
-                    let i = drive.reference[row];
-                    if i < 0.0 { i * base.efficiency } else { i }
-                };
                 let h = drive.t_s[row] - drive.t_s[row - 1];
-                soc -= 0.5 * (flow(row) + flow(row - 1)) * h / (3600.0 * base.capacity_ah);
+                let (from, to) = (drive.reference[row - 1], drive.reference[row]);
+                // Of a straight line through nothing each part counts for itself.
+                let parts = if from * to < 0.0 {
+                    let share = from / (from - to);
+                    [from * share, to * (1.0 - share)]
+                } else {
+                    [from, to]
+                };
+                let flow = |i: f64| if i < 0.0 { i * base.efficiency } else { i };
+                let mean = 0.5 * parts.map(flow).iter().sum::<f64>();
+                soc -= mean * h / (3600.0 * base.capacity_ah);
             }
             simulated[row] = match view {
                 View::StateOfCharge => 100.0 * soc,

@@ -82,3 +82,21 @@ impl Effect for ChargeTransfer {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_is_butler_and_volmers_equation() {
+        // The overvoltage η = 2·(RT/F)·x − promised solves i = i0·(e^(Fη/2RT) − e^(−Fη/2RT)).
+        for t_c in [-10.0, 25.0, 45.0] {
+            let thermal_v = R_OVER_F * (t_c + ZERO_CELSIUS_K);
+            for i in [-40.0, -3.0, -0.01, 0.2, 5.0, 60.0] {
+                let over_v = thermal_v * i / 1.5 - promised_v(i, 1.5, t_c);
+                let there = 1.5 * 2.0 * (over_v / (2.0 * thermal_v)).sinh();
+                assert!((there / i - 1.0).abs() < 1e-9, "{i} {t_c}: {there}");
+            }
+        }
+    }
+}

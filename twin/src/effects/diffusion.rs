@@ -5,7 +5,7 @@ use super::{Card, Clues, Effect, IDEALISED, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 
 /// Terms of the series that are calculated.
-const TERMS: usize = 9;
+const TERMS: usize = 8;
 /// State of charge between which the mean slope of the open-circuit voltage is taken: the ends of the curve are steep.
 const MIDDLE: (f64, f64) = (0.2, 0.8);
 /// Share by which the straight law may be off: the slope of the open-circuit voltage, which makes concentration into voltage, changes
@@ -150,4 +150,36 @@ fn middle_slope_v(table: &[(f64, f64)]) -> Option<f64> {
     let ends = open_circuit_v(table, &[MIDDLE.0, MIDDLE.1]);
     let slope_v = (ends[1] - ends[0]) / (MIDDLE.1 - MIDDLE.0);
     (slope_v > 0.0).then_some(slope_v)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_series_keeps_resistance_and_mean_delay() {
+        let (weights, taus) = series();
+        let moment: f64 = weights.iter().zip(&taus).map(|(w, tau)| w * tau).sum();
+        assert!((weights.iter().sum::<f64>() - 1.0).abs() < 1e-12);
+        assert!((moment - 1.0 / 3.0).abs() < 1e-12);
+        assert!(
+            taus.windows(2)
+                .all(|pair| 0.0 < pair[1] && pair[1] < pair[0])
+        );
+    }
+
+    #[test]
+    fn the_series_rises_with_the_root_of_time() {
+        // A step of current into tanh(√(sτ))/√(sτ): 2·√(t/(π·τ)) while the far side does not tell.
+        let (weights, taus) = series();
+        for share in [0.02, 0.05, 0.1] {
+            let risen: f64 = weights
+                .iter()
+                .zip(&taus)
+                .map(|(w, tau)| w * (1.0 - f64::exp(-share / tau)))
+                .sum();
+            let root = 2.0 * (share / std::f64::consts::PI).sqrt();
+            assert!((risen / root - 1.0).abs() < 0.01, "{share}: {risen} {root}");
+        }
+    }
 }

@@ -713,17 +713,6 @@ impl<'a> Battery<'a> {
     pub fn count(&mut self, drive: &Drive, current_a: &[f64]) {
         let mut soc = vec![0.0; drive.len()];
         let per_as = 1.0 / (3600.0 * self.capacity_ah);
-        // Mean of a current that goes in a straight line, the part of it that charges times the efficiency.
-        let lost = 1.0 - self.efficiency;
-        let flow = |from: f64, to: f64| {
-            let charging = match (from < 0.0, to < 0.0) {
-                (true, true) => 0.5 * (from + to),
-                (true, false) => 0.5 * from * from / (from - to),
-                (false, true) => 0.5 * to * to / (to - from),
-                (false, false) => 0.0,
-            };
-            0.5 * (from + to) - lost * charging
-        };
         for (index, rows) in drive
             .segments
             .iter()
@@ -737,7 +726,8 @@ impl<'a> Battery<'a> {
             let steps = drive.t_s[rows.clone()].windows(2);
             let pairs = current_a[rows.clone()].windows(2);
             for ((soc, pair), times) in soc[after].iter_mut().zip(pairs).zip(steps) {
-                last -= flow(pair[0], pair[1]) * (times[1] - times[0]) * per_as;
+                let mean = mean_flow(pair[0], pair[1], self.efficiency);
+                last -= mean * (times[1] - times[0]) * per_as;
                 *soc = last;
             }
         }
@@ -770,6 +760,17 @@ impl<'a> Battery<'a> {
             *value = open_v - ohms * factor * *value + added_v;
         }
     }
+}
+
+/// Mean of a current that goes in a straight line, what of it charges (below 0) times the efficiency.
+pub fn mean_flow(from: f64, to: f64, efficiency: f64) -> f64 {
+    let charging = match (from < 0.0, to < 0.0) {
+        (true, true) => 0.5 * (from + to),
+        (true, false) => 0.5 * from * from / (from - to),
+        (false, true) => 0.5 * to * to / (to - from),
+        (false, false) => 0.0,
+    };
+    0.5 * (from + to) - (1.0 - efficiency) * charging
 }
 
 /// Factor of a resistance of Arrhenius temperature `b_k`, in K, from 25 °C to a temperature.
@@ -871,6 +872,16 @@ mod tests {
                 assert_eq!(floored(value), value.floor());
             }
         }
+    }
+
+    #[test]
+    fn only_what_charges_is_lost() {
+        // 3 A to −1 A: three quarters of the time it discharges, 1.5 A on the mean.
+        assert!((mean_flow(3.0, -1.0, 0.0) - 0.75 * 1.5).abs() < 1e-12);
+        assert!((mean_flow(-1.0, 3.0, 0.0) - 0.75 * 1.5).abs() < 1e-12);
+        assert!((mean_flow(3.0, -1.0, 1.0) - 1.0).abs() < 1e-12);
+        assert!((mean_flow(-2.0, -4.0, 0.9) + 2.7).abs() < 1e-12);
+        assert!((mean_flow(2.0, 4.0, 0.9) - 3.0).abs() < 1e-12);
     }
 
     #[test]

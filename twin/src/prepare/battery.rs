@@ -2,6 +2,7 @@
 
 use super::{Item, Purpose, Work, checks, held::Freshness, series};
 use crate::{
+    effects::scene::mean_flow,
     failure::Failure,
     model::Battery,
     problem::{Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, View},
@@ -198,13 +199,10 @@ fn start(
 
 /// Ah over a segment: straight lines, charging times the efficiency.
 fn charge_ah(drive: &Drive, rows: std::ops::Range<usize>, efficiency: f64) -> f64 {
-    let flow = |row: usize| {
-        let i = drive.reference[row];
-        if i < 0.0 { i * efficiency } else { i }
-    };
     let mut charge = 0.0;
     for row in rows.start + 1..rows.end {
-        charge += 0.5 * (flow(row) + flow(row - 1)) * (drive.t_s[row] - drive.t_s[row - 1]);
+        let mean_a = mean_flow(drive.reference[row - 1], drive.reference[row], efficiency);
+        charge += mean_a * (drive.t_s[row] - drive.t_s[row - 1]);
     }
     charge / 3600.0
 }
