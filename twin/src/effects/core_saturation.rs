@@ -3,7 +3,7 @@
 use plant::magnetic_core::{MagneticCore, MagneticCoreConfig};
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage};
+use super::{BENT, Card, Clues, Effect, Parameter, Search, Stage};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -33,7 +33,7 @@ impl Effect for CoreSaturation {
             (0.02 * scale.largest, 1.05 * scale.largest)
         } else {
             // Softer than a corner: a hard limit is no core.
-            (0.2, 20.0)
+            (0.2, 200.0)
         }
     }
 
@@ -46,6 +46,10 @@ impl Effect for CoreSaturation {
 
     fn kinked(&self, parameter: usize) -> bool {
         parameter == 0
+    }
+
+    fn curve(&self) -> f64 {
+        BENT
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
