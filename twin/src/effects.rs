@@ -121,7 +121,7 @@ impl Parameter {
         }
     }
 
-    const fn from_bottom(mut self) -> Self {
+    const fn bends_at_once(mut self) -> Self {
         self.from_bottom = true;
         self
     }

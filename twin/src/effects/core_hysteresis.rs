@@ -160,19 +160,19 @@ impl Relays {
         let mut turned = [0.0f64; RELAYS];
         for value in signal {
             let mut sum = 0.0;
-            for k in 0..RELAYS {
-                let (c, per) = (self.thresholds_a[k], self.per_ramp[k]);
+            let relays = self.thresholds_a.iter().zip(&self.per_ramp);
+            for (turned, (c, per)) in turned.iter_mut().zip(relays) {
                 let rising = ramp((*value - c) * per);
                 let falling = ramp((*value + c) * per);
                 let stays = |reached: f64| 2.0 * ramp((reached - STAYS) / (1.0 - STAYS)) - 1.0;
                 if rising > STAYS {
-                    turned[k] = turned[k].max(stays(rising));
+                    *turned = turned.max(stays(rising));
                 }
                 if falling < -STAYS {
-                    turned[k] = turned[k].min(-stays(-falling));
+                    *turned = turned.min(-stays(-falling));
                 }
-                sum += 0.5 * ((rising + falling) + turned[k] * (falling - rising))
-                    - ramp(*value * per);
+                sum +=
+                    0.5 * ((rising + falling) + *turned * (falling - rising)) - ramp(*value * per);
             }
             *value += self.weight * sum;
         }

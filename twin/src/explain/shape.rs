@@ -13,6 +13,8 @@ use crate::problem::{Base, View};
 
 /// Knots of the free curve, at even shares of the rows.
 const KNOTS: usize = 16;
+/// With fewer, there is no curve to be compared.
+const LEAST_KNOTS: usize = 5;
 /// An effect is a curve of the present current if such a curve holds at least this share of what it changes.
 const CURVE: f64 = 0.5;
 /// What the free curve finds counts from so many times the best placebo on: it takes names away.
@@ -80,6 +82,10 @@ pub fn withdraw(bench: &Workbench<'_>, selection: &mut Selection, seed: u64) {
         return;
     }
     let hats = hats(bench);
+    // A drive of few sizes has no curve to show.
+    if hats.len() < LEAST_KNOTS {
+        return;
+    }
     while !selection.named.is_empty() {
         let Some((index, why)) = misfit(bench, &selection.fit, &hats, seed) else {
             return;
