@@ -315,14 +315,11 @@ fn a_rail_a_dead_band_and_a_hum() {
 #[test]
 fn a_curve_of_another_shape_is_unknown() {
     let truth = truth();
-    let square = |i: &f64| i + 2e-4 * i * i;
-    let cube = |i: &f64| i + 1.2e-6 * i.powi(3);
-    // A drop that grows with the logarithm of the current, as a junction's.
-    let junction = |i: &f64| i - 1.5 * (i / 8.0).asinh();
-    let curves: [(&str, &dyn Fn(&f64) -> f64); 3] = [
-        ("square", &square),
-        ("cube", &cube),
-        ("junction", &junction),
+    // The junction's drop grows with the logarithm of the current.
+    let curves: [(&str, fn(&f64) -> f64); 3] = [
+        ("square", |i| i + 2e-4 * i * i),
+        ("cube", |i| i + 1.2e-6 * i.powi(3)),
+        ("junction", |i| i - 1.5 * (i / 8.0).asinh()),
     ];
     for (seed, (name, curve)) in (20..).zip(curves) {
         let reading = truth.current_a.iter().map(curve).collect();

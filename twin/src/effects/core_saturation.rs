@@ -33,7 +33,7 @@ impl Effect for CoreSaturation {
             (0.02 * scale.largest, 1.05 * scale.largest)
         } else {
             // Softer than a corner: a hard limit is no core.
-            (0.2, 200.0)
+            (0.2, 20.0)
         }
     }
 
