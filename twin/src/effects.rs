@@ -124,7 +124,7 @@ impl Parameter {
         }
     }
 
-    const fn from_bottom(mut self) -> Self {
+    const fn bends_at_once(mut self) -> Self {
         self.from_bottom = true;
         self
     }
@@ -205,6 +205,11 @@ pub struct Card {
 /// A first-order filter, a linear drift or a branch of resistance and capacitance describes a real part to five percent.
 const IDEALISED: f64 = 0.05;
 
+/// Share of a constant, a factor or a step by which a real part's curve departs from it.
+const STRAIGHT: f64 = 0.08;
+/// The same of a bend, of which only the place and the end are physics.
+const BENT: f64 = 0.3;
+
 /// An effect of the library.
 pub trait Effect: Sync {
     /// What is said of it.
@@ -261,6 +266,12 @@ pub trait Effect: Sync {
     /// not named then, but an equal of what is.
     fn endless(&self, _parameter: usize, _scale: &Scale) -> f64 {
         f64::INFINITY
+    }
+
+    /// Share of its size, rms, by which the recording's own curve may differ from this one, if it is a curve of the present
+    /// current: parts that an instrument is made of are straight to some percent of what they are off by.
+    fn curve(&self) -> f64 {
+        STRAIGHT
     }
 
     /// What follows from the values, in plain words.

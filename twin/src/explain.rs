@@ -10,6 +10,7 @@ pub mod intervals;
 pub mod locate;
 pub mod screen;
 pub mod select;
+pub mod shape;
 pub mod workbench;
 
 use std::path::{Path, PathBuf};
@@ -198,6 +199,7 @@ fn one(
     if taken_back {
         vague(&bench, &mut selection);
     }
+    shape::withdraw(&bench, &mut selection, options.seed);
     let left = features.explain(&selection.fit.residual, options.seed);
     let confirmed = confirmed(&selection, &others);
     let verdict = judge(

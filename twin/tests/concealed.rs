@@ -311,6 +311,51 @@ fn a_rail_a_dead_band_and_a_hum() {
     );
 }
 
+/// A curve that the library lacks is none of those that it has, even where one of them takes most of it.
+#[test]
+fn a_curve_of_another_shape_is_unknown() {
+    let truth = truth();
+    // The junction's drop grows with the logarithm of the current.
+    let curves: [(&str, fn(&f64) -> f64); 3] = [
+        ("square", |i| i + 2e-4 * i * i),
+        ("cube", |i| i + 1.2e-6 * i.powi(3)),
+        ("junction", |i| i - 1.5 * (i / 8.0).asinh()),
+    ];
+    for (seed, (name, curve)) in (20..).zip(curves) {
+        let reading = truth.current_a.iter().map(curve).collect();
+        let report = explained(&truth, reading, seed, &[]);
+        assert_eq!(
+            report.verdict,
+            Verdict::Unknown,
+            "{name}: {:?} {:?}",
+            report.effects,
+            report.decisions
+        );
+    }
+}
+
+/// The same loop of a core without a gap, by relays of this test's own: what is kept is the sign of what was large enough.
+#[test]
+fn a_closed_core_is_hysteresis() {
+    let truth = truth();
+    let mut reading = truth.current_a.clone();
+    for part in 0..40 {
+        let threshold_a = 10.0 + 0.5 * f64::from(part);
+        let mut kept = 0.0;
+        for (y, i) in reading.iter_mut().zip(&truth.current_a) {
+            if i.abs() > threshold_a {
+                kept = i.signum();
+            }
+            // The middle of the two branches is known.
+            let middle = (i / threshold_a).clamp(-1.0, 1.0);
+            *y += 0.08 * (kept - middle);
+        }
+    }
+    let report = explained(&truth, reading, 30, &[]);
+    let ids: Vec<&str> = report.effects.iter().map(|e| e.id.as_str()).collect();
+    assert_eq!(ids, ["core-hysteresis"], "{:?}", report.decisions);
+}
+
 #[test]
 fn the_same_seed_gives_the_same_report() {
     let truth = truth();

@@ -1,7 +1,7 @@
 //! End of the output.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage};
+use super::{BENT, Card, Clues, Effect, Parameter, Search, Stage};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -55,6 +55,10 @@ impl Effect for Clipping {
 
     fn kinked(&self, _parameter: usize) -> bool {
         true
+    }
+
+    fn curve(&self) -> f64 {
+        BENT
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

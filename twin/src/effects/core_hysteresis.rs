@@ -70,7 +70,8 @@ impl Effect for CoreHysteresis {
         match parameter {
             // A core keeps a field in the direction of what flowed.
             0 => (0.0, 0.2 * scale.full_scale),
-            1 => (1e-3 * scale.full_scale, 0.5 * scale.full_scale),
+            // A loop narrower than a hundredth of the range is no loop: it would follow the noise of the reference.
+            1 => (1e-2 * scale.full_scale, 0.5 * scale.full_scale),
             // From relays that switch at once to loops with no flat part.
             _ => (0.1, 4.0),
         }
@@ -78,7 +79,8 @@ impl Effect for CoreHysteresis {
 
     fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
         let count = if self.closed() { 4 } else { 6 };
-        spaced(0.01 * scale.largest, 0.4 * scale.largest, count)
+        let narrow = (0.01 * scale.largest).max(1.01e-2 * scale.full_scale);
+        spaced(narrow, (0.4 * scale.largest).max(2.0 * narrow), count)
             .into_iter()
             .map(|coercivity| {
                 let mut start = vec![1e-3 * scale.full_scale, coercivity];
@@ -160,19 +162,19 @@ impl Relays {
         let mut turned = [0.0f64; RELAYS];
         for value in signal {
             let mut sum = 0.0;
-            for k in 0..RELAYS {
-                let (c, per) = (self.thresholds_a[k], self.per_ramp[k]);
+            let relays = self.thresholds_a.iter().zip(&self.per_ramp);
+            for (turned, (c, per)) in turned.iter_mut().zip(relays) {
                 let rising = ramp((*value - c) * per);
                 let falling = ramp((*value + c) * per);
                 let stays = |reached: f64| 2.0 * ramp((reached - STAYS) / (1.0 - STAYS)) - 1.0;
                 if rising > STAYS {
-                    turned[k] = turned[k].max(stays(rising));
+                    *turned = turned.max(stays(rising));
                 }
                 if falling < -STAYS {
-                    turned[k] = turned[k].min(-stays(-falling));
+                    *turned = turned.min(-stays(-falling));
                 }
-                sum += 0.5 * ((rising + falling) + turned[k] * (falling - rising))
-                    - ramp(*value * per);
+                sum +=
+                    0.5 * ((rising + falling) + *turned * (falling - rising)) - ramp(*value * per);
             }
             *value += self.weight * sum;
         }

@@ -3,7 +3,7 @@
 use plant::magnetic_core::{MagneticCore, MagneticCoreConfig};
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage};
+use super::{BENT, Card, Clues, Effect, Parameter, Search, Stage};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -14,7 +14,7 @@ static CARD: Card = Card {
     statement: "The magnetic core of the sensor saturates: beyond a knee the reading falls short, smoothly.",
     equation: "y = i for abs(i) < knee; beyond: sgn(i)·(knee + e/(1 + e/(softness·knee))), e = abs(i) − knee (Fröhlich–Kennelly)",
     parameters: &[
-        Parameter::new("knee_a", "A", f64::INFINITY, Search::Logarithmic).from_bottom(),
+        Parameter::new("knee_a", "A", f64::INFINITY, Search::Logarithmic).bends_at_once(),
         Parameter::new("softness", "1", 1.0, Search::Logarithmic).open(),
     ],
     shows: "beyond the knee only",
@@ -46,6 +46,10 @@ impl Effect for CoreSaturation {
 
     fn kinked(&self, parameter: usize) -> bool {
         parameter == 0
+    }
+
+    fn curve(&self) -> f64 {
+        BENT
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

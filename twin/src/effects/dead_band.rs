@@ -1,7 +1,7 @@
 //! Small currents count as zero.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage};
+use super::{BENT, Card, Clues, Effect, Parameter, Search, Stage};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -43,6 +43,10 @@ impl Effect for DeadBand {
             .into_iter()
             .filter(|start| start[0] > 0.0)
             .collect()
+    }
+
+    fn curve(&self) -> f64 {
+        BENT
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

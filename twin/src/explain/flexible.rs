@@ -48,6 +48,20 @@ pub struct Features {
 impl Features {
     /// Of a bench.
     pub fn new(bench: &Workbench<'_>) -> Self {
+        Self::with(bench, |rows| columns(bench, rows))
+    }
+
+    /// Of columns of one's own, each a value for every row of the bench.
+    pub fn of(bench: &Workbench<'_>, columns: &[Vec<f64>]) -> Self {
+        Self::with(bench, |rows| {
+            columns
+                .iter()
+                .map(|column| rows.iter().map(|&row| column[row]).collect())
+                .collect()
+        })
+    }
+
+    fn with(bench: &Workbench<'_>, columns: impl FnOnce(&[usize]) -> Vec<Vec<f64>>) -> Self {
         let stride = bench.len().div_ceil(MOST_ROWS).max(1);
         let mut rows = Vec::new();
         let mut blocks = Vec::new();
@@ -56,7 +70,7 @@ impl Features {
             rows.extend(block.clone().step_by(stride));
             blocks.push(start..rows.len());
         }
-        let mut columns = columns(bench, &rows);
+        let mut columns = columns(&rows);
         for column in &mut columns {
             let size = (dot(column, column) / column.len().max(1) as f64).sqrt();
             if size > 0.0 {

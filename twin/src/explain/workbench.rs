@@ -168,7 +168,7 @@ impl<'a> Workbench<'a> {
             .filter(|effect| {
                 let id = effect.card().id;
                 effect.applies(problem)
-                    && !(quasi_static && effect.card().parameters.iter().any(Parameter::timed))
+                    && (!quasi_static || !effect.card().parameters.iter().any(Parameter::timed))
                     && !without.iter().any(|name| name == id)
                     && !problem.modelled.iter().any(|(known, _)| *known == id)
             })

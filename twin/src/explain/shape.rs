@@ -1,0 +1,151 @@
+//! Whether the curves of the named effects are the recording's own: a lack-of-fit test.
+//!
+//! Effects such as a gain or a saturation say that the reading is a certain curve of the present current. Here that curve is
+//! compared with a free one, straight lines between knots, on held-out blocks and against placebos (the residual moved in time
+//! keeps its colour). What the free curve still finds is set against what *that effect* takes, not against the whole: a wrong
+//! shape can take most of a mismatch and leave little.
+
+use super::fit::{self, Fit, change, dot, normal, solve};
+use super::flexible::Features;
+use super::select::{Selection, percent};
+use super::workbench::Workbench;
+use crate::problem::{Base, View};
+
+/// Knots of the free curve, at even shares of the rows.
+const KNOTS: usize = 16;
+/// With fewer, there is no curve to be compared.
+const LEAST_KNOTS: usize = 5;
+/// An effect is a curve of the present current if such a curve holds at least this share of what it changes.
+const CURVE: f64 = 0.5;
+/// What the free curve finds counts from so many times the best placebo on: it takes names away.
+const CERTAIN: f64 = 2.0;
+
+/// The free curve's columns at all rows: hats between knots of the reading as designed.
+fn hats(bench: &Workbench<'_>) -> Vec<Vec<f64>> {
+    let x = &bench.plain;
+    let mut sorted = x.clone();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let mut knots: Vec<f64> = (0..KNOTS)
+        .map(|k| sorted[(sorted.len() - 1) * k / (KNOTS - 1)])
+        .collect();
+    let least = 1e-3 * bench.scale.largest;
+    knots.dedup_by(|a, b| *a - *b < least);
+    (0..knots.len())
+        .map(|k| {
+            x.iter()
+                .map(|x| {
+                    let rise = if k > 0 {
+                        (x - knots[k - 1]) / (knots[k] - knots[k - 1])
+                    } else {
+                        1.0
+                    };
+                    let fall = if k + 1 < knots.len() {
+                        (knots[k + 1] - x) / (knots[k + 1] - knots[k])
+                    } else {
+                        1.0
+                    };
+                    rise.min(fall).clamp(0.0, 1.0)
+                })
+                .collect()
+        })
+        .collect()
+}
+
+/// Takes out of columns what others span.
+fn clean(columns: &mut [Vec<f64>], others: &[Vec<f64>]) {
+    let Some(rows) = others.first().map(Vec::len) else {
+        return;
+    };
+    let ones = vec![1.0; rows];
+    for column in columns {
+        let (matrix, right) = normal(others, &ones, column, 0..rows);
+        let factors = solve(&matrix, &right, 1e-9);
+        for (other, factor) in others.iter().zip(factors.iter()) {
+            column
+                .iter_mut()
+                .zip(other)
+                .for_each(|(value, other)| *value -= factor * other);
+        }
+    }
+}
+
+/// Energy of a series that columns hold.
+fn held(columns: &[Vec<f64>], series: &[f64]) -> f64 {
+    let ones = vec![1.0; series.len()];
+    let (matrix, right) = normal(columns, &ones, series, 0..series.len());
+    solve(&matrix, &right, 1e-9).dot(&right)
+}
+
+/// Withdraws effects that are curves of the present current, where the recording's own curve is another.
+pub fn withdraw(bench: &Workbench<'_>, selection: &mut Selection, seed: u64) {
+    if !matches!(bench.problem.base, Base::Sensor(_)) || bench.problem.view != View::Sensor {
+        return;
+    }
+    let hats = hats(bench);
+    // A drive of few sizes has no curve to show.
+    if hats.len() < LEAST_KNOTS {
+        return;
+    }
+    while !selection.named.is_empty() {
+        let Some((index, why)) = misfit(bench, &selection.fit, &hats, seed) else {
+            return;
+        };
+        let id = selection.fit.model.members[index].id();
+        selection.refused.push(format!("{id}: {why}"));
+        let without = fit::fit(bench, &selection.fit.model.without(index), None);
+        selection.fit = fit::polish(bench, &without);
+        selection.rename(bench);
+    }
+}
+
+/// The smallest effect whose curve is not the recording's, and why.
+fn misfit(
+    bench: &Workbench<'_>,
+    fit: &Fit,
+    hats: &[Vec<f64>],
+    seed: u64,
+) -> Option<(usize, String)> {
+    let own = &fit.slope(bench).columns;
+    let mut free = hats.to_vec();
+    clean(&mut free, own);
+    let missed = Features::of(bench, &free).explain(&fit.residual, seed);
+    if missed.share <= CERTAIN * missed.placebo_p99 {
+        return None;
+    }
+    let left = missed.share * dot(&fit.residual, &fit.residual);
+    let known = bench.problem.accuracy;
+    let accuracy: f64 = bench
+        .plain
+        .iter()
+        .map(|x| (known.zero + known.gain * x.abs()).powi(2))
+        .sum();
+    // What each takes of a free curve of the current, and all that it changes.
+    let taken: Vec<(f64, f64)> = (0..fit.model.members.len())
+        .map(|index| {
+            let without = fit::fit(bench, &fit.model.without(index), None);
+            let change = change(&fit.predicted, &without.predicted);
+            (held(hats, &change), dot(&change, &change))
+        })
+        .collect();
+    let effect = |index: usize| fit.model.members[index].effect;
+    // The others' equations are idealisations, too.
+    let allowed = |index: usize| {
+        let beside: f64 = (0..taken.len())
+            .filter(|other| *other != index)
+            .map(|other| effect(other).idealised().powi(2) * taken[other].0)
+            .sum();
+        effect(index).curve().powi(2) * taken[index].0 + beside
+    };
+    let (index, size) = (0..taken.len())
+        .map(|index| (index, taken[index].0))
+        .filter(|(index, size)| *size >= CURVE * taken[*index].1)
+        .filter(|(index, _)| left > allowed(*index).max(accuracy))
+        .min_by(|a, b| a.1.total_cmp(&b.1))?;
+    Some((
+        index,
+        format!(
+            "a curve of the current, but another one: a free curve departs from it by {} of its size (rms)",
+            percent((left / size).sqrt())
+        ),
+    ))
+}
