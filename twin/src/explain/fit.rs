@@ -19,6 +19,8 @@ const STEPS: usize = 14;
 const SLOW: f64 = 5e-3;
 /// A step with a new slope that lowers the loss by a smaller share is the last.
 const ENOUGH: f64 = 1e-4;
+/// Shares of a time at which another minimum is looked for in the end.
+const ELSEWHERE: [f64; 4] = [0.8, 0.9, 1.1, 1.25];
 /// How far away values without a slope are tried.
 const SHARES: [f64; 8] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5];
 /// The same for values that are moved together.
@@ -599,6 +601,26 @@ pub fn polish(bench: &Workbench<'_>, from: &Fit) -> Fit {
         best = next;
         if settled {
             break;
+        }
+    }
+    // A load with a rhythm of its own makes a minimum at each window of so many of its periods.
+    if !matches!(bench.problem.base, Base::Sensor(_)) {
+        return best;
+    }
+    for m in 0..best.model.members.len() {
+        let parameters = best.model.members[m].effect.card().parameters;
+        let timed =
+            |p: &usize| parameters[*p].unit == "s" && parameters[*p].search == Search::Logarithmic;
+        for p in (0..parameters.len()).filter(timed) {
+            for share in ELSEWHERE {
+                let mut moved = best.model.clone();
+                moved.members[m].values[p] *= share;
+                let there = fit(bench, &moved, None);
+                let sigma = there.sigma.min(best.sigma);
+                if loss(&there.residual, sigma) < 0.999 * loss(&best.residual, sigma) {
+                    best = there;
+                }
+            }
         }
     }
     best
