@@ -811,6 +811,11 @@ fn swap(
     let (_, here) = losses(bench, now, sigma);
     let (index, best, loss) = others
         .iter()
+        // What could not be named is in nobody's way.
+        .filter(|(_, fit)| {
+            let last = fit.model.members.last();
+            last.is_some_and(|member| at_end(bench, member).is_none())
+        })
         .map(|(index, fit)| (*index, fit, losses(bench, fit, sigma).1))
         .min_by(|a, b| a.2.total_cmp(&b.2))?;
     let last = best.model.members.len() - 1;
