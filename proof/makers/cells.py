@@ -44,6 +44,8 @@ SIZE_TOLERANCE = 0.05
 """A strength is met to this: each try is a solution by PyBaMM."""
 TOLERANCE = 1e-5
 """Of the solver: against a tenth of it the voltage moves by 0.05 mV rms."""
+LONGEST_STEP_S = 2.0
+"""Of the solver: after a rest its own step would be longer than a pulse, and it would go past it without seeing it."""
 RESISTANCE_UNCERTAINTY = 0.05
 MODELS = {"spme": pybamm.lithium_ion.SPMe, "dfn": pybamm.lithium_ion.DFN}
 RELAXATION = ["diffusion", "polarisation", "resistance-soc", "charge-transfer"]
@@ -140,7 +142,7 @@ def run(cell: Cell, values: pybamm.ParameterValues, t_s: np.ndarray) -> tuple[np
     if cell.hysteresis_v:
         options["open-circuit potential"] = ("one-state hysteresis", "single")
     wanted = ["Voltage [V]", "Volume-averaged cell temperature [K]"]
-    solver = pybamm.IDAKLUSolver(rtol=TOLERANCE, atol=TOLERANCE, output_variables=wanted)
+    solver = pybamm.IDAKLUSolver(rtol=TOLERANCE, atol=TOLERANCE, output_variables=wanted, options={"dt_max": LONGEST_STEP_S})
     simulation = pybamm.Simulation(MODELS[cell.model](options), parameter_values=values, solver=solver)
     try:
         solution = simulation.solve([t_s[0], t_s[-1]], t_interp=t_s)
