@@ -478,6 +478,7 @@ fn obstacle(
             && end != 0.0
             && !parameter.open
             && !(parameter.from_bottom && end == low)
+            && !(parameter.to_top && end == high)
         {
             return Some(format!(
                 "{} would be at the end of what is physics, {end:.4}",
