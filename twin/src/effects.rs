@@ -107,6 +107,8 @@ pub struct Parameter {
     pub internal: bool,
     /// The end of its bounds is a value like any other (a rail out of reach, a window without a pause).
     pub open: bool,
+    /// Its upper end is a value like any other (a bend so soft that it ends far beyond the range).
+    pub to_top: bool,
     /// Its lower end is a value like any other (a curve that bends from the start has no knee).
     pub from_bottom: bool,
 }
@@ -121,7 +123,13 @@ impl Parameter {
             internal: false,
             open: false,
             from_bottom: false,
+            to_top: false,
         }
+    }
+
+    const fn ends_far_away(mut self) -> Self {
+        self.to_top = true;
+        self
     }
 
     const fn bends_at_once(mut self) -> Self {
@@ -143,6 +151,7 @@ impl Parameter {
             internal: true,
             open: false,
             from_bottom: false,
+            to_top: false,
         }
     }
 

@@ -482,7 +482,7 @@ fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<Stri
     for (index, (parameter, [low, high])) in known() {
         let (lowest, highest) = member.effect.bounds(index, scale);
         let magnitudes = vague && parameter.search == Search::Logarithmic;
-        let whole = !parameter.open && low <= &lowest && high >= &highest;
+        let whole = !parameter.open && !parameter.to_top && low <= &lowest && high >= &highest;
         if magnitudes || whole {
             return Some(format!(
                 "{} could be {} … {}",

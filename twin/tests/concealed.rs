@@ -314,9 +314,10 @@ fn a_rail_a_dead_band_and_a_hum() {
 /// A curve that the library lacks is none of those that it has, even where one of them takes most of it.
 #[test]
 fn a_curve_of_another_shape_is_unknown() {
+    type Curve = fn(&f64) -> f64;
     let truth = truth();
     // The junction's drop grows with the logarithm of the current.
-    let curves: [(&str, fn(&f64) -> f64); 3] = [
+    let curves: [(&str, Curve); 3] = [
         ("square", |i| i + 2e-4 * i * i),
         ("cube", |i| i + 1.2e-6 * i.powi(3)),
         ("junction", |i| i - 1.5 * (i / 8.0).asinh()),

@@ -15,7 +15,7 @@ static CARD: Card = Card {
     equation: "y = i for abs(i) < knee; beyond: sgn(i)·(knee + e/(1 + e/(softness·knee))), e = abs(i) − knee (Fröhlich–Kennelly)",
     parameters: &[
         Parameter::new("knee_a", "A", f64::INFINITY, Search::Logarithmic).bends_at_once(),
-        Parameter::new("softness", "1", 1.0, Search::Logarithmic).open(),
+        Parameter::new("softness", "1", 1.0, Search::Logarithmic).ends_far_away(),
     ],
     shows: "beyond the knee only",
     looks_like: &["gain", "clipping"],

@@ -541,6 +541,7 @@ pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
             && !parameter.open
             && value < endless
             && !(parameter.from_bottom && end == low)
+            && !(parameter.to_top && end == high)
         {
             return Some(format!(
                 "{} would be at the end of what is physics, {end:.4}",
