@@ -212,7 +212,7 @@ pub struct Card {
 }
 
 /// A first-order filter, a linear drift or a branch of resistance and capacitance describes a real part to five percent.
-const IDEALISED: f64 = 0.05;
+pub const IDEALISED: f64 = 0.05;
 
 /// Share of a constant, a factor or a step by which a real part's curve departs from it.
 const STRAIGHT: f64 = 0.08;

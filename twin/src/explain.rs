@@ -18,7 +18,7 @@ use std::time::Instant;
 
 use crate::effects::chain::{Chain, Nuisance};
 use crate::effects::scene::Scale;
-use crate::effects::{Effect, Search, Stage, find, find_with};
+use crate::effects::{Effect, IDEALISED, Search, Stage, find, find_with};
 use crate::problem::Problem;
 use crate::report::data::{
     EffectReport, FittedModel, HoldoutReport, Location, ParameterReport, Report, SignalPlots,
@@ -49,9 +49,10 @@ const ALIKE: f64 = 0.35;
 const DOUBTFUL: f64 = 0.12;
 /// Below this ratio it is traces, wherever they sit: even a true effect's equation is a model.
 const TRACES: f64 = 0.05;
-/// An effect whose values would have to differ from stretch to stretch, each of them by this share of its energy (14 % of it, rms), is
-/// not what is there: true ones of other people's cells, whose equations are rough, stay below.
-const WAVERS: f64 = 0.02;
+/// An effect whose values would have to differ from stretch to stretch by so many times what its equation may be off by (14 % of it,
+/// rms; 28 % of a branch, whose resistance follows the state of charge) is not what is there: true ones of other people's cells
+/// stay below.
+const WAVERS: f64 = 2.8;
 /// From this share on (5 % rms, as much as an idealised equation may be off) the name is doubted: another physics of much the same
 /// shape could be behind it. The same where so much of what the effects take is left within reach of the inputs, or beyond the
 /// stated noise.
@@ -340,8 +341,9 @@ fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>
 }
 
 /// Whether values would have to differ from stretch to stretch by more than noise makes them, and by much.
-fn waver(variation: &Variation) -> bool {
-    variation.deviations > select::CERTAIN && variation.share > WAVERS
+fn waver(member: &Member, variation: &Variation) -> bool {
+    let rough = member.effect.idealised().max(IDEALISED);
+    variation.deviations > select::CERTAIN && variation.share > (WAVERS * rough).powi(2)
 }
 
 /// Takes effects out again whose values would have to differ from stretch to stretch by more than noise makes them; true if there
@@ -349,10 +351,11 @@ fn waver(variation: &Variation) -> bool {
 fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>]) -> bool {
     let mut any = false;
     while !selection.named.is_empty() && !confirmed(selection, others) {
+        let members = &selection.fit.model.members;
         let found = intervals::variations(bench, &selection.fit)
             .into_iter()
             .enumerate()
-            .filter(|(_, variation)| waver(variation))
+            .filter(|(index, variation)| waver(&members[*index], variation))
             .max_by(|a, b| a.1.share.total_cmp(&b.1.share));
         let Some((index, variation)) = found else {
             break;
@@ -364,9 +367,9 @@ fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted
             variation.deviations
         ));
         let steady = |fit: &Fit| {
-            intervals::variations(bench, fit)
-                .last()
-                .is_some_and(|variation| !waver(variation))
+            let last = intervals::variations(bench, fit);
+            let last = last.last().zip(fit.model.members.last());
+            last.is_some_and(|(variation, member)| !waver(member, variation))
         };
         replace(bench, selection, index, "its values stay", &steady);
         any = true;

@@ -1,7 +1,7 @@
 //! Resistance follows state of charge.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage};
+use super::{Card, Clues, Effect, IDEALISED, Parameter, Search, Stage};
 use crate::problem::{Problem, View};
 
 /// See [`CARD`].
@@ -41,6 +41,11 @@ impl Effect for ResistanceSoc {
 
     fn starts(&self, _scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
         [0.15, 0.3, 0.5, 0.8].map(|knee| vec![0.1, knee]).to_vec()
+    }
+
+    /// Two straight lines for a curve.
+    fn idealised(&self) -> f64 {
+        2.0 * IDEALISED
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
