@@ -371,6 +371,9 @@ impl Folds {
 /// How a placebo moves a residual: around by some rows, reversed first or not.
 pub type Turn = (usize, bool);
 
+/// Sizes up to which nalgebra multiplies by itself (its own threshold is 5).
+const SMALL: usize = 8;
+
 /// Products of columns with a residual moved in many ways: for each block, a row for each way and a column for each column.
 pub fn turned_products(
     columns: &[&[f64]],
@@ -396,6 +399,17 @@ pub fn turned_products(
                 .flat_map(|column| &column[rows.clone()])
                 .copied()
                 .collect();
+            // nalgebra 0.35 reads past a view by rows where it does not hand the product on to matrixmultiply.
+            if [turns.len(), columns.len(), length]
+                .into_iter()
+                .any(|size| size <= SMALL)
+            {
+                return DMatrix::from_fn(turns.len(), columns.len(), |way, column| {
+                    let moved = &moved[way * length..][..length];
+                    let here = &here[column * length..][..length];
+                    moved.iter().zip(here).map(|(a, b)| a * b).sum()
+                });
+            }
             // One way after the other, each a row of the left matrix.
             let moved = DMatrixView::from_slice_with_strides_generic(
                 &moved,
@@ -565,4 +579,43 @@ fn placebos(
         .collect();
     best.sort_unstable_by(f64::total_cmp);
     best[(best.len() * 99).div_ceil(100).min(best.len()) - 1]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn products_are_those_of_moved_residuals() {
+        let residual: Vec<f64> = (0..40).map(|row| f64::from(row * row % 23)).collect();
+        let all: Vec<Vec<f64>> = (1..=12)
+            .map(|k| (0..40).map(|row| f64::from((k * row) % 11)).collect())
+            .collect();
+        let turns: Vec<Turn> = (0..30).map(|by| (by, by % 2 == 1)).collect();
+        let blocks = [0..15, 20..40];
+        // Few columns and many take different ways.
+        for count in [1, 2, 5, 6, 8, 9, 12] {
+            let columns: Vec<&[f64]> = all[..count].iter().map(Vec::as_slice).collect();
+            let products = turned_products(&columns, &residual, &turns, &blocks);
+            for (rows, products) in blocks.iter().zip(&products) {
+                for (way, (by, reversed)) in turns.iter().enumerate() {
+                    for (k, column) in columns.iter().enumerate() {
+                        let sum: f64 = rows
+                            .clone()
+                            .map(|row| {
+                                let at = (row + by) % 40;
+                                let at = if *reversed { 39 - at } else { at };
+                                column[row] * residual[at]
+                            })
+                            .sum();
+                        let found = products[(way, k)];
+                        assert!(
+                            (found - sum).abs() < 1e-9 * sum.abs().max(1.0),
+                            "{count} {way}"
+                        );
+                    }
+                }
+            }
+        }
+    }
 }
