@@ -3,7 +3,7 @@
 use plant::magnetic_core::{MagneticCore, MagneticCoreConfig, MagneticCoreState};
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+use super::{Card, Clues, Effect, IDEALISED, Parameter, Search, Stage, spaced};
 
 /// A core with an air gap, or a closed one: one id, and `spread` for the closed one.
 #[derive(Debug)]
@@ -64,6 +64,15 @@ impl Effect for CoreHysteresis {
 
     fn alternative(&self) -> bool {
         self.closed()
+    }
+
+    /// A closed core's relays are of every size: one spread and one middle are a rough picture of them.
+    fn idealised(&self) -> f64 {
+        if self.closed() {
+            2.0 * IDEALISED
+        } else {
+            IDEALISED
+        }
     }
 
     fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64) {
