@@ -209,9 +209,11 @@ fn run(arguments: &Run) -> Result<bool> {
         processors,
     );
     // Pages are for others: no path of this machine.
-    let here = format!("{}/", campaign.root.display());
+    let here = [&campaign.out, &campaign.root].map(|folder| format!("{}/", folder.display()));
     for (_, why) in summary.not_made.iter_mut().chain(&mut summary.errors) {
-        *why = why.replace(&here, "");
+        for here in &here {
+            *why = why.replace(here.as_str(), "");
+        }
     }
     let pages = match &arguments.docs {
         Some(docs) => absolute(docs)?,
