@@ -952,7 +952,7 @@ fn sentence(
             }
         ),
         Verdict::Ambiguous if doubted => format!(
-            "{name}: explained best by {} ({figures}), but not certainly: what is left has their shape.",
+            "{name}: explained best by {} ({figures}), but not certainly: more is left than noise leaves.",
             ids.join(" and ")
         ),
         Verdict::Ambiguous => format!(
