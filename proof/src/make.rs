@@ -130,10 +130,11 @@ impl Makers {
     /// Makes what of a batch is not there from an earlier run. What could not be made is told by case; the others' files are in
     /// place, their truths taken away.
     pub fn make(&self, batch: &[Planned], out: &Path, safe: &Safe) -> Result<Vec<Option<String>>> {
+        // A batch is of one maker.
+        let sources = self.hash(&batch[0].case.maker)?;
         let mut keys = Vec::new();
         for planned in batch {
-            let case = &planned.case;
-            let text = serde_json::to_string(case)? + &self.hash(&case.maker)?;
+            let text = serde_json::to_string(&planned.case)? + &sources;
             keys.push(hash(text.as_bytes()));
         }
         let there = |planned: &Planned, key: &str| {

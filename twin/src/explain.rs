@@ -203,6 +203,7 @@ fn one(
     shape::withdraw(&bench, &mut selection, options.seed);
     let left = features.explain(&selection.fit.residual, options.seed);
     let confirmed = confirmed(&selection, &others);
+    let unavoidable = unavoidable(&bench, &selection.fit, options.seed);
     let verdict = judge(
         &bench,
         &mut selection,
@@ -210,7 +211,7 @@ fn one(
         confirmed,
         before,
         left,
-        options.seed,
+        unavoidable,
     );
     let (verdict, doubted) = doubt(
         &bench,
@@ -218,7 +219,7 @@ fn one(
         verdict,
         left,
         (confirmed, taken_back),
-        options.seed,
+        unavoidable,
     );
     let model = &selection.fit.model;
 
@@ -567,7 +568,7 @@ fn judge(
     confirmed: bool,
     before: Explainable,
     left: Explainable,
-    seed: u64,
+    unavoidable: f64,
 ) -> Verdict {
     let count = bench.len().max(1) as f64;
     let noise = bench.problem.noise;
@@ -608,7 +609,6 @@ fn judge(
     }
     let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
     let rest = energy(&selection.fit);
-    let unavoidable = unavoidable(bench, &selection.fit, seed);
     let quiet = noise * noise * count;
     let explained = energy(&selection.plain) - rest + (unavoidable - quiet);
     let smooth = if left.is_real() && left.share > LEFT {
@@ -617,7 +617,7 @@ fn judge(
         0.0
     };
     // What is beyond the noise that the design states is structure too, whatever the inputs say of it.
-    let allowed = unavoidable.max(known * known * count);
+    let allowed = allowed(bench, unavoidable);
     let beyond = if noise > 0.0 && rest > LOUD * LOUD * allowed {
         rest - allowed
     } else {
@@ -670,9 +670,9 @@ fn judge(
 }
 
 /// The least energy that the design lets be left: what is unavoidable, or the reference's own zero.
-fn stated(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
+fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
     let zero = bench.problem.accuracy.zero;
-    unavoidable(bench, fit, seed).max(zero * zero * bench.len() as f64)
+    unavoidable.max(zero * zero * bench.len() as f64)
 }
 
 /// The verdict once more: names whose values waver, or that leave what follows the inputs, are the best of the library and no
@@ -683,7 +683,7 @@ fn doubt(
     verdict: Verdict,
     left: Explainable,
     (confirmed, taken_back): (bool, bool),
-    seed: u64,
+    unavoidable: f64,
 ) -> (Verdict, bool) {
     if taken_back && verdict == Verdict::NoMismatch {
         selection.decisions.push(
@@ -698,7 +698,7 @@ fn doubt(
     let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
     let rest = energy(&selection.fit);
     let explained = (energy(&selection.plain) - rest).max(1e-300);
-    let allowed = stated(bench, &selection.fit, seed);
+    let allowed = allowed(bench, unavoidable);
     // What is left beyond the stated noise, if that is stated well enough.
     let deviation = allowed * (2.0 / bench.len().max(1) as f64).sqrt();
     let certain = rest > STATED * allowed && rest - allowed > select::CERTAIN * deviation;

@@ -158,6 +158,13 @@ pub struct Accuracy {
     pub gain: f64,
 }
 
+impl Problem {
+    /// Whether time means nothing in this recording.
+    pub fn quasi_static(&self) -> bool {
+        matches!(&self.base, Base::Sensor(base) if base.quasi_static)
+    }
+}
+
 impl Drive {
     /// Number of rows.
     pub fn len(&self) -> usize {

@@ -3,6 +3,7 @@
 pub mod board;
 pub mod command;
 
+use crate::effects::scene::mean_flow;
 use crate::problem::{Base, BatteryBase, Drive, Observed, Problem, SensorBase, View};
 
 /// What the simulation as designed says at each observed row, without any effect; NaN where the drive does not reach.
@@ -54,16 +55,7 @@ fn battery(base: &BatteryBase, drive: &Drive, observed: &Observed, view: View) -
             if row > rows.start {
                 let h = drive.t_s[row] - drive.t_s[row - 1];
                 let (from, to) = (drive.reference[row - 1], drive.reference[row]);
-                // Of a straight line through nothing each part counts for itself.
-                let parts = if from * to < 0.0 {
-                    let share = from / (from - to);
-                    [from * share, to * (1.0 - share)]
-                } else {
-                    [from, to]
-                };
-                let flow = |i: f64| if i < 0.0 { i * base.efficiency } else { i };
-                let mean = 0.5 * parts.map(flow).iter().sum::<f64>();
-                soc -= mean * h / (3600.0 * base.capacity_ah);
+                soc -= mean_flow(from, to, base.efficiency) * h / (3600.0 * base.capacity_ah);
             }
             simulated[row] = match view {
                 View::StateOfCharge => 100.0 * soc,

@@ -152,6 +152,21 @@ impl Effect for SampledWindow {
     }
 }
 
+fn product(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// When a series of times in s and values is largest at a frequency, in turns from time 0, −½ … ½.
+fn turns(frequency_hz: f64, series: impl Iterator<Item = (f64, f64)>) -> f64 {
+    let (mut sine, mut cosine) = (0.0, 0.0);
+    for (t, value) in series {
+        let turn = std::f64::consts::TAU * frequency_hz * t;
+        sine += value * turn.sin();
+        cosine += value * turn.cos();
+    }
+    f64::atan2(sine, cosine) / std::f64::consts::TAU
+}
+
 /// Rates in Hz at which readings move, and when they first do, in s from the first reading: a held one moves at one phase of each
 /// period only, however the current moves.
 fn updates(clues: &Clues<'_>, scale: &Scale) -> Vec<(f64, f64)> {
@@ -162,7 +177,6 @@ fn updates(clues: &Clues<'_>, scale: &Scale) -> Vec<(f64, f64)> {
             .collect()
     };
     let (seen, simulated) = (moves(clues.observed), moves(clues.predicted));
-    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let share = product(&seen, &simulated) / product(&simulated, &simulated).max(1e-300);
     let beyond: Vec<f64> = seen
         .iter()
@@ -173,14 +187,9 @@ fn updates(clues: &Clues<'_>, scale: &Scale) -> Vec<(f64, f64)> {
         .into_iter()
         .filter(|frequency_hz| *frequency_hz > 0.0)
         .map(|frequency_hz| {
-            let (mut sine, mut cosine) = (0.0, 0.0);
-            for (t, by) in clues.t_s.iter().zip(&beyond) {
-                let turn = std::f64::consts::TAU * frequency_hz * (t - clues.t_s[0]);
-                sine += by * turn.sin();
-                cosine += by * turn.cos();
-            }
+            let times = clues.t_s.iter().map(|t| t - clues.t_s[0]);
             // It is between two readings.
-            let turns = f64::atan2(sine, cosine) / std::f64::consts::TAU;
+            let turns = turns(frequency_hz, times.zip(beyond.iter().copied()));
             (
                 frequency_hz,
                 turns / frequency_hz - 0.5 * scale.reading_step_s,
@@ -218,7 +227,6 @@ fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
             rate.push(slope);
         }
     }
-    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let all = product(&rate, &rate);
     if all.is_nan() || all <= 0.0 {
         return Vec::new();
@@ -238,13 +246,7 @@ fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
         }
         let mut best: Option<(f64, [f64; 4])> = None;
         for beat in [-0.5, -0.25, 0.0, 0.25, 0.5].map(|by| line + by / span) {
-            let (mut sine, mut cosine) = (0.0, 0.0);
-            for row in rows() {
-                let turn = std::f64::consts::TAU * beat * t_s[row];
-                sine += course[row] * turn.sin();
-                cosine += course[row] * turn.cos();
-            }
-            let turns = f64::atan2(-sine, cosine) / std::f64::consts::TAU;
+            let turns = -turns(beat, rows().map(|row| (t_s[row], course[row])));
             // Ages rise at the beat, or fall: where the period is a little shorter, or longer, than what fits into a row.
             for (way, phase) in [(1.0, turns - 0.25), (-1.0, -turns - 0.25)] {
                 for phase in [phase - 0.04, phase, phase + 0.04] {

@@ -23,8 +23,12 @@ const ENOUGH: f64 = 1e-4;
 const ELSEWHERE: [f64; 4] = [0.8, 0.9, 1.1, 1.25];
 /// How far away values without a slope are tried.
 const SHARES: [f64; 8] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5];
+/// So often from where the last of them led.
+const TIMES: usize = 4;
 /// The same for values that are moved together.
 const TOGETHER: [f64; 6] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4];
+/// The same for them.
+const TIMES_TOGETHER: usize = 10;
 
 /// What the model file says of the base is off by this many of its own standard uncertainties at most: beyond them it is no
 /// uncertainty but physics that was left out, and has a name.
@@ -701,90 +705,70 @@ fn search_steps(
     known: Option<Slope>,
 ) -> Option<Slope> {
     let mut here = cost(bench, model, residual, sigma, used);
+    // Goes to other values of a member if they cost less.
+    let mut try_values = |model: &mut Model, m: usize, values: Vec<f64>| -> bool {
+        let mut moved = model.clone();
+        moved.members[m].values = values;
+        let there_predicted = bench.run(&moved);
+        let there_residual = bench.residual(&there_predicted);
+        let there = cost(bench, &moved, &there_residual, sigma, used);
+        let better = there < here;
+        if better {
+            (*model, *predicted, *residual) = (moved, there_predicted, there_residual);
+            here = there;
+        }
+        better
+    };
     let mut found = false;
     for m in 0..model.members.len() {
         let effect = model.members[m].effect;
+        let held = model.held.filter(|(member, _)| *member == m);
+        let near =
+            |model: &Model, share: f64| effect.near(&model.members[m].values, &bench.scale, share);
         // Where values depend on one another they are moved together.
-        for share in TOGETHER {
-            for _ in 0..10 {
-                let Some(near) = effect.near(&model.members[m].values, &bench.scale, share) else {
-                    break;
-                };
-                let mut better = false;
-                for mut values in near {
-                    for (p, value) in values.iter_mut().enumerate() {
-                        let (low, high) = effect.bounds(p, &bench.scale);
-                        *value = value.clamp(low, high);
-                    }
-                    let mut moved = model.clone();
-                    if let Some((held, p)) = model.held
-                        && held == m
-                    {
-                        values[p] = model.members[m].values[p];
-                    }
-                    moved.members[m].values = values;
-                    let there_predicted = bench.run(&moved);
-                    let there_residual = bench.residual(&there_predicted);
-                    let there = cost(bench, &moved, &there_residual, sigma, used);
-                    if there < here {
-                        (*model, *predicted, *residual) = (moved, there_predicted, there_residual);
-                        here = there;
-                        better = true;
-                    }
-                }
-                if !better {
-                    break;
-                }
-                found = true;
-            }
-        }
-        if effect
-            .near(&model.members[m].values, &bench.scale, 0.0)
-            .is_some()
-        {
-            continue;
-        }
-        for (p, _) in effect
-            .card()
-            .parameters
-            .iter()
-            .enumerate()
-            .filter(|(p, parameter)| {
-                parameter.search == Search::Stepped && model.held != Some((m, *p))
-            })
-            .collect::<Vec<_>>()
-        {
-            for share in SHARES {
-                for _ in 0..4 {
+        if near(model, 0.0).is_some() {
+            for share in TOGETHER {
+                for _ in 0..TIMES_TOGETHER {
                     let mut better = false;
-                    for sign in [1.0, -1.0] {
-                        let mut moved = model.clone();
-                        let values = &mut moved.members[m].values;
-                        // A phase may be zero: it moves by shares of its period.
-                        values[p] += sign
-                            * share
-                            * if values[p] == 0.0 {
-                                values[0]
-                            } else {
-                                values[p]
-                            };
-                        let (low, high) = effect.bounds(p, &bench.scale);
-                        values[p] = values[p].clamp(low, high);
-                        let there_predicted = bench.run(&moved);
-                        let there_residual = bench.residual(&there_predicted);
-                        let there = cost(bench, &moved, &there_residual, sigma, used);
-                        if there < here {
-                            (*model, *predicted, *residual) =
-                                (moved, there_predicted, there_residual);
-                            here = there;
-                            better = true;
-                            found = true;
-                            break;
+                    for mut values in near(model, share).unwrap_or_default() {
+                        for (p, value) in values.iter_mut().enumerate() {
+                            let (low, high) = effect.bounds(p, &bench.scale);
+                            *value = value.clamp(low, high);
                         }
+                        if let Some((_, p)) = held {
+                            values[p] = model.members[m].values[p];
+                        }
+                        better |= try_values(model, m, values);
                     }
                     if !better {
                         break;
                     }
+                    found = true;
+                }
+            }
+            continue;
+        }
+        let parameters = effect.card().parameters;
+        let stepped = |p: &usize| parameters[*p].search == Search::Stepped && held != Some((m, *p));
+        for p in (0..parameters.len()).filter(stepped) {
+            let (low, high) = effect.bounds(p, &bench.scale);
+            for share in SHARES {
+                for _ in 0..TIMES {
+                    let better = [1.0, -1.0].into_iter().any(|sign| {
+                        let mut values = model.members[m].values.clone();
+                        // A phase may be zero: it moves by shares of its period.
+                        let size = if values[p] == 0.0 {
+                            values[0]
+                        } else {
+                            values[p]
+                        };
+                        values[p] = (values[p] + sign * share * size).clamp(low, high);
+                        try_values(model, m, values)
+                    });
+                    if !better {
+                        break;
+                    }
+                    found = true;
                 }
             }
         }

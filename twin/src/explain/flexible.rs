@@ -102,7 +102,7 @@ impl Features {
             columns,
             gram,
             folds: Folds::new(grams),
-            timeless: bench.quasi_static(),
+            timeless: bench.problem.quasi_static(),
         }
     }
 

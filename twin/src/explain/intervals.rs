@@ -478,21 +478,6 @@ mod tests {
 
     /// More of the same, to be looked at: `cargo test -p twin --lib coverage -- --ignored --nocapture`.
     #[test]
-    #[ignore = "a table, not a bound"]
-    fn coverage_by_kind_of_noise() {
-        for (name, coloured, stated, step) in [
-            ("white", WHITE, true, 0.0),
-            ("quantised", WHITE, true, 0.8),
-            ("quick, stated", QUICK, true, 0.0),
-            ("quick, not stated", QUICK, false, 0.0),
-            ("slow, stated", SLOW, true, 0.0),
-            ("slow, not stated", SLOW, false, 0.0),
-        ] {
-            println!("{name}: {:?}", coverage(1000, coloured, stated, step));
-        }
-    }
-
-    #[test]
     fn students_percentiles_are_those_of_the_tables() {
         for (freedom, table) in [(3.0, 3.182), (5.0, 2.571), (10.0, 2.228), (23.0, 2.069)] {
             let found = student(freedom);

@@ -211,7 +211,7 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
         })
         .collect();
     entries.sort_by(|a, b| b.gain.total_cmp(&a.gain));
-    let timeless = bench.quasi_static();
+    let timeless = bench.problem.quasi_static();
     let placebo_p99 = placebos(&entries, &residual, &thin.blocks, timeless, seed, draws);
     Screening {
         entries,
@@ -246,11 +246,11 @@ fn fewer(signatures: &mut Vec<Signature>, residual: &[f64]) {
         left = others;
         let shape = |signature: &Signature| {
             let column = &signature.columns[0];
-            -dot(column, residual).powi(2) / dot(column, column).max(1e-300)
+            dot(column, residual).powi(2) / dot(column, column).max(1e-300)
         };
         these.sort_by(|a, b| a.loss.total_cmp(&b.loss));
         let mut others = these.split_off(MOST_STARTS.min(these.len()));
-        others.sort_by_cached_key(|signature| std::cmp::Reverse((-shape(signature)).to_bits()));
+        others.sort_by_cached_key(|signature| std::cmp::Reverse(shape(signature).to_bits()));
         others.truncate(MOST_STARTS);
         kept.extend(these);
         kept.extend(others);

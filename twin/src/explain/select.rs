@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::fit::{Fit, change, fit, held_out, huber, polish};
+use super::fit::{Fit, change, dot, fit, held_out, huber, polish};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search, Stage, find};
@@ -471,7 +471,7 @@ fn small(
     let mut all: f64 = change.iter().map(|c| c * c).sum();
     if before.model.members.len() < after.model.members.len() {
         // What the others would do in its place is theirs.
-        all = all.min(apart(before, after));
+        all = all.min(apart(&before.predicted, &after.predicted));
     }
     if all < beside {
         return Some(format!(
@@ -517,8 +517,7 @@ pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
     {
         let (low, high) = member.effect.bounds(p, &bench.scale);
         let value = member.values[p];
-        let endless = member.effect.endless(p, &bench.scale);
-        if value >= endless {
+        if value >= member.effect.endless(p, &bench.scale) {
             return Some(format!(
                 "{} would be {value:.4}, more than the recording tells",
                 parameter.name
@@ -539,7 +538,6 @@ pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
         if let Some(end) = end
             && end != 0.0
             && !parameter.open
-            && value < endless
             && !(parameter.from_bottom && end == low)
             && !(parameter.to_top && end == high)
         {
@@ -552,12 +550,10 @@ pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
     None
 }
 
-/// Energy by which two models' simulations are apart.
-fn apart(one: &Fit, other: &Fit) -> f64 {
-    change(&one.predicted, &other.predicted)
-        .iter()
-        .map(|change| change * change)
-        .sum()
+/// Energy by which two simulations are apart.
+fn apart(one: &[f64], other: &[f64]) -> f64 {
+    let change = change(one, other);
+    dot(&change, &change)
 }
 
 /// Energy by which the other effects' equations may be off, those of the model file among them.
@@ -571,14 +567,7 @@ fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
                 return 0.0;
             }
             let without = bench.run(&fit.model.without(other));
-            let energy: f64 = fit
-                .predicted
-                .iter()
-                .zip(&without)
-                .map(|(with, without)| (with - without).powi(2))
-                .filter(|change| change.is_finite())
-                .sum();
-            share * share * energy
+            share * share * apart(&fit.predicted, &without)
         })
         .sum();
     bench.modelled + others
@@ -887,7 +876,7 @@ fn name(
                     let last = other.model.members.len() - 1;
                     share(bench, &without, other) >= least
                         // What the other effects' equations may be off by does not decide between two.
-                        && (apart(now, other) < beside || !beaten(bench, other, now))
+                        && (apart(&now.predicted, &other.predicted) < beside || !beaten(bench, other, now))
                         // At the end of what is physics it cannot be named, and speaks against another's being certain.
                         && small(bench, &without, other, last, 1.0).is_none()
                 })

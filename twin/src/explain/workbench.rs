@@ -161,14 +161,14 @@ impl<'a> Workbench<'a> {
         };
         let scale = scale(problem, &t_s, &y, &plain);
         let blocks = blocks(&rows);
-        let quasi_static = matches!(&problem.base, Base::Sensor(base) if base.quasi_static);
         let library = LIBRARY
             .iter()
             .copied()
             .filter(|effect| {
                 let id = effect.card().id;
                 effect.applies(problem)
-                    && (!quasi_static || !effect.card().parameters.iter().any(Parameter::timed))
+                    && (!problem.quasi_static()
+                        || !effect.card().parameters.iter().any(Parameter::timed))
                     && !without.iter().any(|name| name == id)
                     && !problem.modelled.iter().any(|(known, _)| *known == id)
             })
@@ -279,11 +279,6 @@ impl<'a> Workbench<'a> {
             Some(variance) => energy / variance.max(1e-300).sqrt(),
             None => f64::INFINITY,
         }
-    }
-
-    /// Whether time means nothing in this recording.
-    pub fn quasi_static(&self) -> bool {
-        matches!(&self.problem.base, Base::Sensor(base) if base.quasi_static)
     }
 
     /// The simulation at the rows that count.
