@@ -28,6 +28,14 @@ pub struct Chain<'a> {
     beside: Vec<f64>,
 }
 
+/// A simulation that was run up to one of its members.
+#[derive(Clone, Debug)]
+pub struct Begun<'a> {
+    scene: Scene<'a>,
+    /// Links that were run.
+    done: usize,
+}
+
 /// One step of the simulation.
 #[derive(Clone, Copy)]
 enum Link<'m> {
@@ -114,6 +122,29 @@ impl<'a> Chain<'a> {
                     .zip(noise)
                     .for_each(|(value, noise)| *value += noise);
             }
+        }
+        scene.signal
+    }
+
+    /// The simulation up to a member, to be gone on with for many values of it.
+    pub fn begin(&self, members: &Members<'_>, nuisance: Nuisance, index: usize) -> Begun<'a> {
+        let links = self.links(members);
+        let here =
+            |link: &Link<'_>| matches!(link, Link::Effect(_, _, Some(member)) if *member == index);
+        let done = links.iter().position(here).unwrap_or_default();
+        let mut scene = self.start.clone();
+        for link in &links[..done] {
+            self.apply(&mut scene, *link, nuisance);
+        }
+        Begun { scene, done }
+    }
+
+    /// The rest of it: what the simulation says at each observed row. The members are those that it was begun with; the
+    /// values may differ of the one up to which it was begun.
+    pub fn go_on(&self, begun: &Begun<'a>, members: &Members<'_>, nuisance: Nuisance) -> Vec<f64> {
+        let mut scene = begun.scene.clone();
+        for link in &self.links(members)[begun.done..] {
+            self.apply(&mut scene, *link, nuisance);
         }
         scene.signal
     }

@@ -139,10 +139,14 @@ impl Effect for SampledWindow {
                     if ended >= 0.0 && ended != known {
                         known = ended;
                         let from = start + ended * period;
-                        let before = begin.integral(&total, &scene.signal, from, held);
                         let to = from + duty * period;
-                        let after = end.integral(&total, &scene.signal, to, held);
-                        value = (after - before) / (duty * period);
+                        // The mean over a straight line is its value in the middle.
+                        value = end.value(&scene.signal, 0.5 * (from + to), held);
+                        if !(end.shares(from) && end.shares(to)) {
+                            let before = begin.integral(&total, &scene.signal, from, held);
+                            let after = end.integral(&total, &scene.signal, to, held);
+                            value = (after - before) / (duty * period);
+                        }
                     }
                 }
                 *out = value;

@@ -485,6 +485,12 @@ impl<'a> Cursor<'a> {
         let end = series[at] + (series[at + 1] - series[at]) * (h / step);
         integral[at] + 0.5 * (series[at] + end) * h
     }
+
+    /// Whether a time is in the step that begins at the row where the cursor stands.
+    #[inline]
+    pub fn shares(&self, t: f64) -> bool {
+        t >= self.t_s[self.at] && self.at + 1 < self.rows.end && t <= self.t_s[self.at + 1]
+    }
 }
 
 /// Boxcar mean over the `window_s` before each row; before the start of a segment the signal stood at its first value.

@@ -6,7 +6,7 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
 use super::workbench::{Model, Workbench};
 use crate::effects::Search;
-use crate::effects::chain::Change;
+use crate::effects::chain::{Begun, Change};
 use crate::problem::Base;
 
 /// Residuals beyond this many standard deviations count by their size, not by its square (Huber).
@@ -29,6 +29,10 @@ const TIMES: usize = 4;
 const TOGETHER: [f64; 6] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4];
 /// The same for them.
 const TIMES_TOGETHER: usize = 10;
+/// The first of these steps tell whether there is anything to be found.
+const COARSE: usize = 2;
+/// A smaller drop of the loss is not worth another round of the same steps: one of 0.5 is a standard deviation.
+const WORTH: f64 = 0.1;
 
 /// What the model file says of the base is off by this many of its own standard uncertainties at most: beyond them it is no
 /// uncertainty but physics that was left out, and has a name.
@@ -550,7 +554,7 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
     let mut sigma = spread(&residual);
     let mut known = None;
     // The spread falls while the model becomes better: the loss follows in rounds.
-    for _ in 0..3 {
+    for round in 0..3 {
         let before = sigma;
         known = descend(
             bench,
@@ -568,7 +572,7 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
             &mut residual,
             sigma,
             used,
-            known,
+            (known, round > 0),
         );
         sigma = spread(&residual);
         if sigma > 0.9 * before {
@@ -694,7 +698,7 @@ fn descend(
     fresh.then_some(slope)
 }
 
-/// Values at which the simulation jumps: tried around where they are, ever closer.
+/// Values at which the simulation jumps: tried around where they are, ever closer; `again` if that was done for another spread.
 fn search_steps(
     bench: &Workbench<'_>,
     model: &mut Model,
@@ -702,20 +706,24 @@ fn search_steps(
     residual: &mut Vec<f64>,
     sigma: f64,
     used: Option<&[f64]>,
-    known: Option<Slope>,
+    (known, again): (Option<Slope>, bool),
 ) -> Option<Slope> {
     let mut here = cost(bench, model, residual, sigma, used);
     // Goes to other values of a member if they cost less.
-    let mut try_values = |model: &mut Model, m: usize, values: Vec<f64>| -> bool {
+    let mut try_values = |model: &mut Model,
+                          here: &mut f64,
+                          (m, begun): (usize, &Begun<'_>),
+                          values: Vec<f64>|
+     -> bool {
         let mut moved = model.clone();
         moved.members[m].values = values;
-        let there_predicted = bench.run(&moved);
+        let there_predicted = bench.go_on(begun, &moved);
         let there_residual = bench.residual(&there_predicted);
         let there = cost(bench, &moved, &there_residual, sigma, used);
-        let better = there < here;
+        let better = there < *here;
         if better {
             (*model, *predicted, *residual) = (moved, there_predicted, there_residual);
-            here = there;
+            *here = there;
         }
         better
     };
@@ -725,11 +733,26 @@ fn search_steps(
         let held = model.held.filter(|(member, _)| *member == m);
         let near =
             |model: &Model, share: f64| effect.near(&model.members[m].values, &bench.scale, share);
+        let parameters = effect.card().parameters;
+        let stepped = |p: &usize| parameters[*p].search == Search::Stepped && held != Some((m, *p));
+        if !(0..parameters.len()).any(|p| stepped(&p)) {
+            continue;
+        }
+        let begun = bench.begin(model, m);
         // Where values depend on one another they are moved together.
         if near(model, 0.0).is_some() {
-            for share in TOGETHER {
+            let without = bench.residual(&bench.run(&model.without(m)));
+            let idle = cost(bench, model, &without, sigma, used);
+            // The best of so many choices takes this much of noise.
+            let chance = effect.choices(&bench.scale).max(1.0).ln();
+            let from = if again { COARSE } else { 0 };
+            for (tried, share) in TOGETHER.into_iter().enumerate().skip(from) {
+                // What is no better than chance after the coarse steps is not near a minimum that is.
+                if tried >= COARSE && here > idle - chance {
+                    break;
+                }
                 for _ in 0..TIMES_TOGETHER {
-                    let mut better = false;
+                    let (before, mut better) = (here, false);
                     for mut values in near(model, share).unwrap_or_default() {
                         for (p, value) in values.iter_mut().enumerate() {
                             let (low, high) = effect.bounds(p, &bench.scale);
@@ -738,18 +761,16 @@ fn search_steps(
                         if let Some((_, p)) = held {
                             values[p] = model.members[m].values[p];
                         }
-                        better |= try_values(model, m, values);
+                        better |= try_values(model, &mut here, (m, &begun), values);
                     }
-                    if !better {
+                    found |= better;
+                    if before - here < WORTH {
                         break;
                     }
-                    found = true;
                 }
             }
             continue;
         }
-        let parameters = effect.card().parameters;
-        let stepped = |p: &usize| parameters[*p].search == Search::Stepped && held != Some((m, *p));
         for p in (0..parameters.len()).filter(stepped) {
             let (low, high) = effect.bounds(p, &bench.scale);
             for share in SHARES {
@@ -763,7 +784,7 @@ fn search_steps(
                             values[p]
                         };
                         values[p] = (values[p] + sign * share * size).clamp(low, high);
-                        try_values(model, m, values)
+                        try_values(model, &mut here, (m, &begun), values)
                     });
                     if !better {
                         break;

@@ -476,7 +476,6 @@ mod tests {
         );
     }
 
-    /// More of the same, to be looked at: `cargo test -p twin --lib coverage -- --ignored --nocapture`.
     #[test]
     fn students_percentiles_are_those_of_the_tables() {
         for (freedom, table) in [(3.0, 3.182), (5.0, 2.571), (10.0, 2.228), (23.0, 2.069)] {

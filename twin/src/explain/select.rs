@@ -19,6 +19,12 @@ const FIRSTS: usize = 5;
 const PAIRS: usize = 6;
 /// Starts of each that are fitted.
 const STARTS: usize = 2;
+/// A pair is fitted if its start takes this share of what a pair has to take: of 203 that took enough in the end, all but three
+/// began so.
+const STARTED: f64 = 0.5;
+/// A rival is fitted if its start takes this share of what the effect takes whose place it would have: of 830 that took half as
+/// much in the end, all but eight began so.
+const RIVALS: f64 = 0.1;
 /// A named effect takes away at least this share of the held-out squared error (2 % of the held-out rms), overall or where it
 /// acts.
 const FLOOR: f64 = 0.04;
@@ -312,14 +318,14 @@ fn endless(bench: &Workbench<'_>, member: &Member) -> bool {
     values.any(|(p, value)| *value >= member.effect.endless(p, &bench.scale))
 }
 
-/// Fits the most promising entries in place of nothing.
-fn fits(
+/// Models with the most promising entries added.
+fn promising(
     bench: &Workbench<'_>,
     now: &Fit,
     entries: &[Entry],
     most: usize,
     starts: usize,
-) -> Vec<(Fit, f64)> {
+) -> Vec<Model> {
     let mut effects: Vec<Vec<&Entry>> = Vec::new();
     for entry in entries
         .iter()
@@ -343,11 +349,16 @@ fn fits(
         chosen.extend(of);
     }
     chosen
+        .into_iter()
+        .map(|entry| replaced(&now.model, entry.member.effect).with(entry.member.clone()))
+        .collect()
+}
+
+/// Fits models side by side.
+fn fits(bench: &Workbench<'_>, models: Vec<Model>) -> Vec<Fit> {
+    models
         .into_par_iter()
-        .map(|entry| {
-            let model = replaced(&now.model, entry.member.effect).with(entry.member.clone());
-            (fit(bench, &model, None), entry.gain)
-        })
+        .map(|model| fit(bench, &model, None))
         .collect()
 }
 
@@ -359,27 +370,25 @@ fn step(
     decisions: &mut Vec<String>,
     refused: &mut Vec<String>,
 ) -> Option<(Fit, f64)> {
-    let fits = fits(bench, now, &screening.entries, FITTED, STARTS);
-    let sigma = fits
-        .iter()
-        .map(|(fit, _)| fit.sigma)
-        .fold(now.sigma, f64::min);
+    let models = promising(bench, now, &screening.entries, FITTED, STARTS);
+    let fits = fits(bench, models);
+    let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
     let mut ranked: Vec<(Fit, f64)> = fits
         .into_iter()
-        .map(|(fit, _)| {
+        .map(|fit| {
             let loss = losses(bench, &fit, sigma).1;
             (fit, loss)
         })
         .collect();
     ranked.sort_by(|a, b| a.1.total_cmp(&b.1));
     let (_, before) = losses(bench, now, sigma);
-    let promising = ranked
+    let candidates = ranked
         .into_iter()
         .take_while(|(_, loss)| *loss < before)
         .map(|(fit, _)| fit)
         .filter(|fit| !only_aligns(bench, now, fit, fit.model.members.len() - 1))
         .take(TRIED);
-    for better in promising {
+    for better in candidates {
         let index = better.model.members.len() - 1;
         let id = better.model.members[index].id();
         let gain = share(bench, now, &better);
@@ -589,18 +598,21 @@ fn pair(
     if now.model.members.len() + 2 > MOST_EFFECTS {
         return None;
     }
+    let least = pairs_gain(screening.placebo_p99);
     // A masked effect shows once the other is fitted: from each of the best single ones one goes a step further.
-    let firsts = fits(bench, now, &screening.entries, FIRSTS, 1);
-    let fits: Vec<Fit> = firsts
+    let firsts = promising(bench, now, &screening.entries, FIRSTS, 1);
+    let models: Vec<Model> = fits(bench, firsts)
         .iter()
-        .flat_map(|(first, _)| {
-            let next = screen(bench, first, 0, 0);
-            fits(bench, first, &next.entries, FIRSTS, 1)
+        .flat_map(|first| {
+            let taken = share(bench, now, first).max(0.0);
+            let mut entries = screen(bench, first, 0, 0).entries;
+            entries.retain(|entry| taken + entry.gain * (1.0 - taken) > STARTED * least);
+            promising(bench, first, &entries, FIRSTS, 1)
         })
-        .map(|(fit, _)| fit)
         // One more branch of the first is no second effect.
-        .filter(|fit| fit.model.members.len() == now.model.members.len() + 2)
+        .filter(|model| model.members.len() == now.model.members.len() + 2)
         .collect();
+    let fits = fits(bench, models);
     let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
     let mut ranked: Vec<(Fit, f64)> = fits
         .into_iter()
@@ -639,6 +651,11 @@ fn pair(
     Some((best, screening.placebo_p99))
 }
 
+/// Share of the held-out error that two effects have to take together: each may gain what a placebo gains.
+fn pairs_gain(p99: f64) -> f64 {
+    (1.0 - (1.0 - p99.min(1.0)).powi(2)).max(FLOOR)
+}
+
 /// Why a pair, the last two effects of a fit, is not accepted.
 fn unfit(
     bench: &Workbench<'_>,
@@ -649,13 +666,12 @@ fn unfit(
 ) -> Option<String> {
     let count = best.model.members.len();
     let gain = share(bench, now, best);
-    // Two effects may each gain what a placebo gains.
-    let chance = 1.0 - (1.0 - p99.min(1.0)).powi(2);
-    if gain <= chance || gain < FLOOR {
+    let least = pairs_gain(p99);
+    if gain <= least {
         return Some(format!(
-            "takes {} of the held-out error, two placebos up to {}",
+            "takes {} of the held-out error; two placebos, or the practical floor: {}",
             percent(gain),
-            percent(chance)
+            percent(least)
         ));
     }
     if single.is_some_and(|single| share(bench, single, best) < MUCH) {
@@ -728,7 +744,12 @@ fn backward(
 
 /// Effects that may stand in an effect's place: those that it is said to look like, those that are said to look like it, and
 /// the best of a screening of what it explains.
-fn rivals(bench: &Workbench<'_>, without: &Fit, model: &Model, id: &str) -> Vec<Member> {
+fn rivals(
+    bench: &Workbench<'_>,
+    without: &Fit,
+    model: &Model,
+    (id, taken): (&str, f64),
+) -> Vec<Member> {
     let card = find(id).map(|effect| effect.card());
     let alike = |effect: &&'static dyn Effect| {
         let other = effect.card();
@@ -738,7 +759,8 @@ fn rivals(bench: &Workbench<'_>, without: &Fit, model: &Model, id: &str) -> Vec<
     let screening = screen(bench, without, 0, 0);
     let mut members: Vec<Member> = Vec::new();
     let mut count: Vec<(&'static str, usize)> = Vec::new();
-    for (rank, entry) in screening.entries.iter().enumerate() {
+    let near = |entry: &&Entry| entry.gain > RIVALS * taken;
+    for (rank, entry) in screening.entries.iter().take_while(near).enumerate() {
         let other = entry.member.effect;
         if other.card().id == id || model.has(other.card().id) {
             continue;
@@ -762,15 +784,15 @@ fn rivals(bench: &Workbench<'_>, without: &Fit, model: &Model, id: &str) -> Vec<
 
 /// Fits every rival in the place of every effect.
 fn swapped(bench: &Workbench<'_>, now: &Fit) -> Vec<(usize, Fit)> {
-    (0..now.model.members.len())
+    let (places, models): (Vec<usize>, Vec<Model>) = (0..now.model.members.len())
         .flat_map(|index| {
             let id = now.model.members[index].id();
             let without = fit(bench, &now.model.without(index), None);
-            let rivals = rivals(bench, &without, &now.model, id);
-            // An alignment that is free can take over what a rival explains, and leave it nothing to be named for.
-            let models: Vec<Model> = rivals
+            let taken = share(bench, &without, now);
+            rivals(bench, &without, &now.model, (id, taken))
                 .into_iter()
                 .map(|rival| without.model.with(rival))
+                // An alignment that is free can take over what a rival explains, and leave it nothing to be named for.
                 .flat_map(|model| {
                     let unaligned = bench.aligns(&model).then(|| Model {
                         unaligned: true,
@@ -779,13 +801,11 @@ fn swapped(bench: &Workbench<'_>, now: &Fit) -> Vec<(usize, Fit)> {
                     [Some(model), unaligned]
                 })
                 .flatten()
-                .collect();
-            models
-                .into_par_iter()
-                .map(|model| (index, fit(bench, &model, None)))
+                .map(|model| (index, model))
                 .collect::<Vec<_>>()
         })
-        .collect()
+        .unzip();
+    places.into_iter().zip(fits(bench, models)).collect()
 }
 
 fn swap(

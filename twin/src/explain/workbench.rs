@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use rand_distr::{Distribution as _, StandardNormal};
 
-use crate::effects::chain::{Chain, Change, Nuisance, Variation};
+use crate::effects::chain::{Begun, Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
 use crate::effects::{Clues, Effect, LIBRARY, Parameter, Stage, find_with};
 use crate::problem::{Base, Problem, View};
@@ -284,6 +284,17 @@ impl<'a> Workbench<'a> {
     /// The simulation at the rows that count.
     pub fn run(&self, model: &Model) -> Vec<f64> {
         self.thinned(self.everywhere(model))
+    }
+
+    /// The simulation up to a member; see [`Chain::begin`].
+    pub fn begin(&self, model: &Model, member: usize) -> Begun<'a> {
+        self.chain.begin(&members(model), model.nuisance, member)
+    }
+
+    /// The rest of it at the rows that count, the member's values being others.
+    pub fn go_on(&self, begun: &Begun<'a>, model: &Model) -> Vec<f64> {
+        let all = self.chain.go_on(begun, &members(model), model.nuisance);
+        self.thinned(all)
     }
 
     /// The simulation of models that each differ from one in a single respect, at the rows that count.
