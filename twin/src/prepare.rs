@@ -66,8 +66,14 @@ pub struct Item {
 }
 
 /// Mean square of the width of a board's reading: the step of the range that it is in, and what the current moves by while the
-/// moment is uncertain.
-fn squared_width(sensor: &Sensor, base: &SensorBase, observed: &Observed, high: &[f64]) -> f64 {
+/// moment is uncertain, by the board's jitter and by what the rows tell of it.
+fn squared_width(
+    sensor: &Sensor,
+    slack_s: f64,
+    base: &SensorBase,
+    observed: &Observed,
+    high: &[f64],
+) -> f64 {
     let (mut rows, mut large) = (0.0, 0.0);
     let (mut pairs, mut slopes) = (0.0, 0.0);
     let mut last: Option<usize> = None;
@@ -88,7 +94,8 @@ fn squared_width(sensor: &Sensor, base: &SensorBase, observed: &Observed, high: 
     }
     let share = large / f64::max(rows, 1.0);
     let steps = base.step.powi(2) * (1.0 - share + share * base.range_ratio.max(1.0).powi(2));
-    steps + sensor.jitter_s.powi(2) * slopes / f64::max(pairs, 1.0)
+    let moments = sensor.jitter_s.powi(2) + slack_s.powi(2);
+    steps + moments * slopes / f64::max(pairs, 1.0)
 }
 
 /// Ages that are tried to either side where the rows do not tell the age of a reading.
@@ -313,6 +320,7 @@ impl Work<'_> {
             alignment_s: sensor.alignment_s,
             ..SensorBase::default()
         };
+        let mut slack_s = 0.0;
         if let Some(board) = board {
             base.step = board.step_a();
             base.full_scale = Some(board.full_scale_a());
@@ -324,15 +332,14 @@ impl Work<'_> {
                 earlier.t_s.iter_mut().for_each(|t| *t -= age_s);
                 board.run(&drive, sensor.held_reference, &earlier, pace, false)
             };
-            let slack_s = match pace {
-                Pace::Seen => board.slack_s(&observed),
-                _ => 0.0,
-            };
+            if pace == Pace::Seen {
+                slack_s = board.slack_s(&observed);
+            }
             let (_, reported) = phase::closest(sensor.age_s, (slack_s, PHASES), &observed, run);
             self.compare_range_flag(board, &mut drive, &observed, &reported.range_high);
             base.reading = reported.current_a;
             fresh = reported.fresh;
-            squares = squared_width(sensor, &base, &observed, &reported.range_high);
+            squares = squared_width(sensor, slack_s, &base, &observed, &reported.range_high);
             let mut spoiled = 0;
             for (row, reading) in base.reading.iter().enumerate() {
                 if reading.is_nan() && observed.valid[row] {
@@ -363,6 +370,7 @@ impl Work<'_> {
             accuracy: Accuracy {
                 zero: sensor.accuracy.zero,
                 gain: sensor.accuracy.gain,
+                moment_s: 0.5 * slack_s,
             },
         };
         (problem, fresh)

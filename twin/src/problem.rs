@@ -149,13 +149,15 @@ pub struct Coloured {
     pub tau_s: f64,
 }
 
-/// Accuracy of an instrument: `zero + gain·abs(reading)`.
+/// Accuracy of an instrument, and of when it was read: `zero + gain·abs(reading) + moment·abs(d reading/dt)`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Accuracy {
     /// Constant part, in the view's unit.
     pub zero: f64,
     /// Share of the reading.
     pub gain: f64,
+    /// Time by which the moments of readings may all be off, in s.
+    pub moment_s: f64,
 }
 
 impl Problem {

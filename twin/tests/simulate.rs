@@ -383,6 +383,57 @@ fn simulating_needs_nothing_but_the_drive() {
 }
 
 /// Rows of 10 ms see a conversion up to 10 ms late; the conversions themselves come evenly.
+/// How far from the board's readings they are that are told from the rows that saw them, in A, where each conversion ends at
+/// `ends_s` times the period instead of at its number of times.
+fn apart_where_conversions_wander(ends: impl Fn(f64) -> f64) -> f64 {
+    let board = Board::new(FrontEndKind::Hah1bv, 1).unwrap();
+    // As single conversions follow one another: not a part of the step between rows.
+    let period_s = 1.04 * board.conversion_s();
+    let t_s: Vec<f64> = (0..9000).map(|k| f64::from(k) * 0.01).collect();
+    let drive = Drive {
+        reference: t_s.iter().map(|t| 200.0 * (2.0 * t).sin()).collect(),
+        segments: vec![0..9000],
+        continues: vec![false],
+        t_s: t_s.clone(),
+        ..Drive::default()
+    };
+    let ended: Vec<f64> = (1..)
+        .map(|number| ends(f64::from(number)) * period_s)
+        .take_while(|end_s| *end_s < 89.9)
+        .collect();
+    // What a board reports whose rows are the conversions themselves.
+    let exact = observed(ended.clone());
+    let read = board
+        .run(&drive, false, &exact, Pace::Seen, false)
+        .current_a;
+    let mut seen = observed(t_s.clone());
+    seen.valid.fill(false);
+    let mut true_a = vec![f64::NAN; t_s.len()];
+    for (end_s, current_a) in ended.iter().zip(read) {
+        let row = t_s.partition_point(|t| t < end_s);
+        seen.valid[row] = true;
+        seen.value[row] = current_a;
+        true_a[row] = current_a;
+    }
+    let again = board.run(&drive, false, &seen, Pace::Seen, false).current_a;
+    let squares: Vec<f64> = (500..8500)
+        .filter(|row| seen.valid[*row])
+        .map(|row| (true_a[row] - again[row]).powi(2))
+        .collect();
+    (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
+}
+
+#[test]
+fn conversions_may_wander() {
+    let even = apart_where_conversions_wander(|number| number);
+    // By 3 ms to either side and back in half a minute.
+    let wander = apart_where_conversions_wander(|number| number + 0.1 * (0.007 * number).sin());
+    // The two periods beat: of each four conversions rows leave a quarter of a step open, 1.25 ms to either side, at 283 A/s rms.
+    // An even grid would leave the other by 3 ms / √2, 0.6 A.
+    let open_a = 0.35;
+    assert!(even < open_a && wander < open_a, "{even} {wander}");
+}
+
 #[test]
 fn conversions_are_even_though_rows_see_them_late() {
     let board = Board::new(FrontEndKind::Hah1bv, 1).unwrap();

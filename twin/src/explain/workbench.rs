@@ -221,6 +221,19 @@ impl<'a> Workbench<'a> {
         self.rows.len()
     }
 
+    /// How fast the simulation as designed changes up to a row, in the view's unit per second; 0 at the first one.
+    pub fn slope_per_s(&self, row: usize) -> f64 {
+        let Some(before) = row.checked_sub(1) else {
+            return 0.0;
+        };
+        let step_s = self.t_s[row] - self.t_s[before];
+        if step_s > 0.0 {
+            (self.plain[row] - self.plain[before]) / step_s
+        } else {
+            0.0
+        }
+    }
+
     /// True without any.
     pub fn is_empty(&self) -> bool {
         self.rows.is_empty()

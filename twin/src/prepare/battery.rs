@@ -125,6 +125,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
                 accuracy: Accuracy {
                     zero: accuracy.zero,
                     gain: accuracy.gain,
+                    moment_s: 0.0,
                 },
             },
             rows,

@@ -116,6 +116,7 @@ pub(super) fn item(
             // What an uncertain moment moves a difference by is no physics either: two moments, each even over its width,
             // √2·width/√12.
             gain: sensor.accuracy.gain + spec.jitter_s / 6f64.sqrt() / spacing_s,
+            moment_s: 0.0,
         },
     };
     Ok(Some(Item {

@@ -35,6 +35,9 @@ const ADC1_STEP_V: f64 = 3.3 / 4096.0;
 const FEWEST_OF_A_GRID: usize = 20;
 /// Share of the likeness that an even grid would show, from which there is one.
 const GRID_LIKE: f64 = 0.85;
+/// Changes to either side that tell the phase of the grid at one: each is late by up to a step between rows, so that their mean is
+/// known to a thirtieth of a step.
+const AROUND: usize = 40;
 /// The ADS1100's clock may be off by a fifth (*assumed*, as `core-logic` has it).
 const CLOCK_WITHIN: f64 = 0.2;
 
@@ -415,9 +418,10 @@ fn ends(observed: &Observed, rows: std::ops::Range<usize>, period_s: f64) -> Vec
         Some((grid_s, start_s)) => {
             // The grid is known to a part of a step only, and no change comes before its conversion: but for the few that a range
             // change makes. A row can come much later, where a value was the same again.
+            let wander = Wander::new(&changes, grid_s, start_s + 0.5 * step_s);
             let mut late_s: Vec<f64> = changes
                 .iter()
-                .map(|t| (t - start_s) / grid_s)
+                .map(|t| (t - start_s - wander.at(*t)) / grid_s)
                 .map(|late| (late - late.round()) * grid_s)
                 .collect();
             let few = late_s.len() / 200;
@@ -427,11 +431,70 @@ fn ends(observed: &Observed, rows: std::ops::Range<usize>, period_s: f64) -> Vec
             } else {
                 0.0
             };
+            let mut last: Option<(f64, f64)> = None;
             times()
-                .map(|t| start_s + ((t - start_s + early_s) / grid_s + 1e-6).floor() * grid_s)
+                .map(|t| {
+                    let start_s = start_s + wander.at(t);
+                    let mut end_s =
+                        start_s + ((t - start_s + early_s) / grid_s + 1e-6).floor() * grid_s;
+                    // Where the phase moves, two rows that saw a conversion each could seem to see the same.
+                    if let Some((row_s, before_s)) = last
+                        && t - row_s > 0.5 * grid_s
+                    {
+                        end_s = end_s.max(t.min(before_s + 0.75 * grid_s));
+                    }
+                    last = Some((t, end_s));
+                    end_s
+                })
                 .collect()
         }
         None => times().collect(),
+    }
+}
+
+/// By how much the phase of a grid differs from its mean in the course of a recording: single conversions are each started when the
+/// last one was found, and a change of range starts one anew.
+struct Wander {
+    t_s: Vec<f64>,
+    by_s: Vec<f64>,
+}
+
+impl Wander {
+    /// From the times at which changes were seen, and the mean of where they fall on the grid.
+    fn new(changes: &[f64], grid_s: f64, mean_s: f64) -> Self {
+        let turns: Vec<(f64, f64)> = changes
+            .iter()
+            .map(|t| (std::f64::consts::TAU * (t - mean_s) / grid_s).sin_cos())
+            .collect();
+        // Sums from the first on: a window's is a difference of two.
+        let mut sums = vec![(0.0, 0.0)];
+        for (sine, cosine) in turns {
+            let (sines, cosines) = sums[sums.len() - 1];
+            sums.push((sines + sine, cosines + cosine));
+        }
+        let by_s = (0..changes.len())
+            .map(|at| {
+                let from = sums[at.saturating_sub(AROUND)];
+                let to = sums[(at + AROUND + 1).min(changes.len())];
+                let turns = f64::atan2(to.0 - from.0, to.1 - from.1) / std::f64::consts::TAU;
+                turns * grid_s
+            })
+            .collect();
+        Self {
+            t_s: changes.to_vec(),
+            by_s,
+        }
+    }
+
+    /// At a time, in s: that of the nearest change.
+    fn at(&self, t: f64) -> f64 {
+        let after = self.t_s.partition_point(|change| *change < t);
+        let before = after.saturating_sub(1);
+        let nearer = match self.t_s.get(after) {
+            Some(next) if next - t < (t - self.t_s[before]).abs() => after,
+            _ => before,
+        };
+        self.by_s.get(nearer).copied().unwrap_or_default()
     }
 }
 
