@@ -42,6 +42,10 @@ const SLOW: f64 = 10.0;
 /// Where no effect passes, loudness is judged by this share of the residual's sizes, which is so many standard deviations of a
 /// normal distribution: single readings at wrong moments are no unknown physics.
 const COMMON: (f64, f64) = (0.8, 1.2816);
+/// Times the stated noise that noise never is.
+const STRAY: f64 = 8.0;
+/// Fewer readings beyond it are not told from a slip of the log.
+const STRAYS: usize = 2;
 /// From this correlation on, what is left sits where the named effects act: their shape is wrong.
 const ALIKE: f64 = 0.35;
 /// From this ratio of what is left explainable to what the named effects explain on, their names are not to be trusted: another
@@ -65,6 +69,8 @@ const WORSE: f64 = 1.05;
 const CONFIRMED: f64 = 0.6;
 /// An interval whose ends differ by this factor says nothing.
 const VAGUE: f64 = 100.0;
+/// Starts of an effect that are fitted in another's place; of more the nearest.
+const STAND_INS: usize = 12;
 /// Folds for the figures of held-out blocks, each with a fit of its own.
 const FOLDS: usize = 5;
 
@@ -442,28 +448,49 @@ fn stand_in(
 ) -> Option<Fit> {
     let named = selection.named.iter().find(|one| one.index == index)?;
     let clues = bench.clues(&selection.fit.predicted);
-    named
+    let mut fits: Vec<Fit> = named
         .equivalent
         .iter()
         .filter(|id| !without.has(id))
         .filter_map(|id| find(id))
         .flat_map(|effect| {
-            effect
-                .starts(&bench.scale, &clues)
-                .into_iter()
-                .map(move |values| Member { effect, values })
+            let starts = effect.starts(&bench.scale, &clues).into_iter();
+            let models = starts.map(|values| without.with(Member { effect, values }));
+            nearest(bench, models.collect())
         })
-        .map(|member| fit::fit(bench, &without.with(member), None))
-        .filter(|fit| {
-            let last = fit.model.members.len() - 1;
-            let intervals = intervals::intervals(bench, fit);
-            let member = &fit.model.members[last];
-            select::at_end(bench, member).is_none()
-                && untold(&bench.scale, member, &intervals[last]).is_none()
-                && holds(fit)
+        .map(|model| fit::fit(bench, &model, None))
+        .collect();
+    fits.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+    let found = fits.into_iter().find(|fit| {
+        let last = fit.model.members.len() - 1;
+        let member = &fit.model.members[last];
+        select::at_end(bench, member).is_none()
+            && untold(
+                &bench.scale,
+                member,
+                &intervals::intervals(bench, fit)[last],
+            )
+            .is_none()
+            && holds(fit)
+    });
+    found.map(|fit| fit::polish(bench, &fit))
+}
+
+/// Of many models the nearest to the readings as they are.
+fn nearest(bench: &Workbench<'_>, models: Vec<Model>) -> Vec<Model> {
+    if models.len() <= STAND_INS {
+        return models;
+    }
+    let mut ranked: Vec<(f64, Model)> = models
+        .into_iter()
+        .map(|model| {
+            let residual = bench.residual(&bench.run(&model));
+            (residual.iter().map(|r| r.abs()).sum(), model)
         })
-        .min_by(|a, b| a.cost.total_cmp(&b.cost))
-        .map(|fit| fit::polish(bench, &fit))
+        .collect();
+    ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let nearest = ranked.into_iter().take(STAND_INS);
+    nearest.map(|(_, model)| model).collect()
 }
 
 /// Why the recording does not tell an effect's values: an interval over orders of magnitude or over all that is physics, or
@@ -600,6 +627,14 @@ fn judge(
                 percent(before.placebo_p99)
             ));
             Verdict::Unknown
+        } else if let Some(strays) = strays(bench, residual) {
+            selection.decisions.push(format!(
+                "No effect passes, yet {} readings, and not the others, are off by more than {STRAY} times the stated noise, by up to {} {}: unknown.",
+                strays.count,
+                short(strays.largest),
+                bench.problem.unit
+            ));
+            Verdict::Unknown
         } else {
             selection.decisions.push(
                 "No effect passes, and no smooth function of the recorded inputs explains more than chance.".into(),
@@ -667,6 +702,36 @@ fn judge(
     } else {
         Verdict::Explained
     }
+}
+
+/// Single readings that no stated noise makes.
+struct Strays {
+    count: usize,
+    largest: f64,
+}
+
+/// Readings far beyond the stated noise, and what reference and time stamps are accurate to, if there are some and they make most of
+/// what is left.
+fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
+    let noise = bench.problem.noise;
+    if noise <= 0.0 {
+        return None;
+    }
+    let known = bench.problem.accuracy;
+    let sizes: Vec<f64> = (0..bench.len())
+        .filter(|&row| {
+            let moved = known.moment_s * bench.slope_per_s(row).abs();
+            let accurate = known.zero + known.gain * bench.plain[row].abs() + moved;
+            residual[row].abs() > STRAY * noise + accurate
+        })
+        .map(|row| residual[row].abs())
+        .collect();
+    let energy: f64 = sizes.iter().map(|size| size * size).sum();
+    let all: f64 = residual.iter().map(|r| r * r).sum();
+    (sizes.len() >= STRAYS && energy > 0.5 * all).then(|| Strays {
+        count: sizes.len(),
+        largest: sizes.iter().fold(0.0, |most, size| most.max(*size)),
+    })
 }
 
 /// The least energy that the design lets be left: what is unavoidable, or the reference's own zero.

@@ -176,6 +176,24 @@ fn nothing_is_found_where_nothing_is_concealed() {
 }
 
 #[test]
+fn single_readings_far_beyond_noise_are_no_agreement() {
+    let truth = truth();
+    let with = |strays: &[(usize, f64)]| {
+        let mut reading = truth.current_a.clone();
+        for (row, by_a) in strays {
+            reading[*row] += by_a;
+        }
+        explained(&truth, reading, 7, &[])
+    };
+    // One may be a slip of the log.
+    assert_eq!(with(&[(4000, 94.0)]).verdict, Verdict::NoMismatch);
+    let report = with(&[(1700, -24.0), (4000, 94.0), (7200, 31.0)]);
+    assert_eq!(report.verdict, Verdict::Unknown, "{:?}", report.effects);
+    let said = report.decisions.join("\n");
+    assert!(said.contains("3 readings") && said.contains(" A"), "{said}");
+}
+
+#[test]
 fn a_zero_error_and_a_sensitivity_error() {
     let truth = truth();
     let reading = truth.current_a.iter().map(|i| i + 0.4).collect();
