@@ -501,24 +501,46 @@ pub fn solve(matrix: &DMatrix<f64>, right: &DVector<f64>, damping: f64) -> DVect
     solved
 }
 
-/// Huber's loss of the rows in use, and the penalty.
-fn cost(
-    bench: &Workbench<'_>,
-    model: &Model,
-    residual: &[f64],
+/// What a fit makes small: Huber's loss in a spread, of the rows in use.
+#[derive(Clone, Copy)]
+struct Aim<'a, 'b> {
+    bench: &'a Workbench<'b>,
     sigma: f64,
-    used: Option<&[f64]>,
-) -> f64 {
-    let per_sigma = 1.0 / sigma;
-    let loss = match used {
-        None => loss(residual, sigma),
-        Some(used) => sum_of(residual, used, |r, used| used * huber(r * per_sigma)),
-    };
-    let penalty: f64 = coordinates(bench, model)
-        .iter()
-        .map(|(_, _, prior, at)| 0.5 * prior * at * at)
-        .sum();
-    loss + penalty
+    /// Weighs rows (0: left out).
+    used: Option<&'a [f64]>,
+}
+
+impl Aim<'_, '_> {
+    /// The loss, and the penalty of the base's nuisances.
+    fn cost(&self, model: &Model, residual: &[f64]) -> f64 {
+        let per_sigma = 1.0 / self.sigma;
+        let loss = match self.used {
+            None => loss(residual, self.sigma),
+            Some(used) => sum_of(residual, used, |r, used| used * huber(r * per_sigma)),
+        };
+        let penalty: f64 = coordinates(self.bench, model)
+            .iter()
+            .map(|(_, _, prior, at)| 0.5 * prior * at * at)
+            .sum();
+        loss + penalty
+    }
+}
+
+/// A model with its simulation at the rows that count.
+struct Point {
+    model: Model,
+    predicted: Vec<f64>,
+    residual: Vec<f64>,
+}
+
+impl Point {
+    fn of(bench: &Workbench<'_>, model: Model, predicted: Vec<f64>) -> Self {
+        Self {
+            residual: bench.residual(&predicted),
+            model,
+            predicted,
+        }
+    }
 }
 
 /// What a simulation says more than another; 0 beyond the drive's ends, where nothing is known.
@@ -549,39 +571,26 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
     if !bench.aligns(&model) {
         model.nuisance.alignment_s = 0.0;
     }
-    let mut predicted = bench.run(&model);
-    let mut residual = bench.residual(&predicted);
-    let mut sigma = spread(&residual);
+    let predicted = bench.run(&model);
+    let mut here = Point::of(bench, model, predicted);
+    let mut sigma = spread(&here.residual);
     let mut known = None;
     // The spread falls while the model becomes better: the loss follows in rounds.
     for round in 0..3 {
         let before = sigma;
-        known = descend(
-            bench,
-            &mut model,
-            &mut predicted,
-            &mut residual,
-            sigma,
-            used,
-            known,
-        );
-        known = search_steps(
-            bench,
-            &mut model,
-            &mut predicted,
-            &mut residual,
-            sigma,
-            used,
-            (known, round > 0),
-        );
-        sigma = spread(&residual);
+        let aim = Aim { bench, sigma, used };
+        known = descend(aim, &mut here, known);
+        if search_steps(aim, &mut here, round > 0) {
+            known = descend(aim, &mut here, None);
+        }
+        sigma = spread(&here.residual);
         if sigma > 0.9 * before {
             break;
         }
     }
-    let cost = cost(bench, &model, &residual, sigma, used);
+    let cost = Aim { bench, sigma, used }.cost(&here.model, &here.residual);
     if used.is_none() {
-        bench.remember(from, &model, sigma, cost);
+        bench.remember(from, &here.model, sigma, cost);
     }
     let slope = OnceLock::new();
     if let Some(known) = known
@@ -590,9 +599,9 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
         let _ = slope.set(Arc::new(known));
     }
     Fit {
-        model,
-        predicted,
-        residual,
+        model: here.model,
+        predicted: here.predicted,
+        residual: here.residual,
         sigma,
         cost,
         slope: Arc::new(slope),
@@ -635,24 +644,18 @@ pub fn polish(bench: &Workbench<'_>, from: &Fit) -> Fit {
 }
 
 /// Levenberg–Marquardt from a model whose slope may be known; gives the slope where it ends if that is known.
-fn descend(
-    bench: &Workbench<'_>,
-    model: &mut Model,
-    predicted: &mut Vec<f64>,
-    residual: &mut Vec<f64>,
-    sigma: f64,
-    used: Option<&[f64]>,
-    known: Option<Slope>,
-) -> Option<Slope> {
+fn descend(aim: Aim<'_, '_>, here: &mut Point, known: Option<Slope>) -> Option<Slope> {
+    let Aim { bench, sigma, used } = aim;
     let mut damping = 1e-4;
-    let mut here = cost(bench, model, residual, sigma, used);
-    let mut slope = known.unwrap_or_else(|| slope(bench, model, predicted));
+    let mut cost = aim.cost(&here.model, &here.residual);
+    let mut slope = known.unwrap_or_else(|| slope(bench, &here.model, &here.predicted));
     let mut fresh = true;
     let mut steps = 0;
     while steps < STEPS && !slope.is_empty() {
         steps += 1;
         let (per_sigma, per_square) = (1.0 / sigma, 1.0 / (sigma * sigma));
-        let mut weights: Vec<f64> = residual
+        let mut weights: Vec<f64> = here
+            .residual
             .iter()
             .map(|r| weight(r * per_sigma) * per_square)
             .collect();
@@ -662,20 +665,25 @@ fn descend(
                 .zip(used)
                 .for_each(|(weight, used)| *weight *= used);
         }
-        let (mut matrix, mut right) = normal(&slope.columns, &weights, residual, 0..bench.len());
+        let (mut matrix, mut right) =
+            normal(&slope.columns, &weights, &here.residual, 0..bench.len());
         slope.penalty(&mut matrix, &mut right);
         let mut gain = 0.0;
         for _ in 0..6 {
             let step = solve(&matrix, &right, damping);
-            let moved = slope.moved(bench, model, step.as_slice());
-            let there_predicted = bench.run(&moved);
-            let there_residual = bench.residual(&there_predicted);
-            let there = cost(bench, &moved, &there_residual, sigma, used);
-            if there < here {
-                gain = (here - there) / here.max(1e-300);
-                slope.learn(step.as_slice(), predicted, &there_predicted, &moved);
-                (*model, *predicted, *residual) = (moved, there_predicted, there_residual);
-                here = there;
+            let moved = slope.moved(bench, &here.model, step.as_slice());
+            let predicted = bench.run(&moved);
+            let there = Point::of(bench, moved, predicted);
+            let less = aim.cost(&there.model, &there.residual);
+            if less < cost {
+                gain = (cost - less) / cost.max(1e-300);
+                slope.learn(
+                    step.as_slice(),
+                    &here.predicted,
+                    &there.predicted,
+                    &there.model,
+                );
+                (*here, cost) = (there, less);
                 damping = (damping * 0.2).max(1e-9);
                 break;
             }
@@ -689,7 +697,7 @@ fn descend(
             if fresh && gain < ENOUGH {
                 return (gain == 0.0).then_some(slope);
             }
-            slope = self::slope(bench, model, predicted);
+            slope = self::slope(bench, &here.model, &here.predicted);
             fresh = true;
         } else {
             fresh = false;
@@ -699,84 +707,119 @@ fn descend(
 }
 
 /// Values at which the simulation jumps: tried around where they are, ever closer; `again` if that was done for another spread.
-fn search_steps(
-    bench: &Workbench<'_>,
-    model: &mut Model,
-    predicted: &mut Vec<f64>,
-    residual: &mut Vec<f64>,
-    sigma: f64,
-    used: Option<&[f64]>,
-    (known, again): (Option<Slope>, bool),
-) -> Option<Slope> {
-    let mut here = cost(bench, model, residual, sigma, used);
-    // Goes to other values of a member if they cost less.
-    let mut try_values = |model: &mut Model,
-                          here: &mut f64,
-                          (m, begun): (usize, &Begun<'_>),
-                          values: Vec<f64>|
-     -> bool {
-        let mut moved = model.clone();
-        moved.members[m].values = values;
-        let there_predicted = bench.go_on(begun, &moved);
-        let there_residual = bench.residual(&there_predicted);
-        let there = cost(bench, &moved, &there_residual, sigma, used);
-        let better = there < *here;
+/// True if others were found.
+fn search_steps(aim: Aim<'_, '_>, here: &mut Point, again: bool) -> bool {
+    let mut found = false;
+    for m in 0..here.model.members.len() {
+        let member = &here.model.members[m];
+        let effect = member.effect;
+        let parameters = effect.card().parameters;
+        let stepped: Vec<usize> = (0..parameters.len())
+            .filter(|p| parameters[*p].search == Search::Stepped)
+            .filter(|p| here.model.held != Some((m, *p)))
+            .collect();
+        if stepped.is_empty() {
+            continue;
+        }
+        let together = effect.near(&member.values, &aim.bench.scale, 0.0).is_some();
+        let mut search = Stepping {
+            aim,
+            begun: aim.bench.begin(&here.model, m),
+            member: m,
+            cost: aim.cost(&here.model, &here.residual),
+            here,
+        };
+        found |= if together {
+            search.together(again)
+        } else {
+            search.alone(&stepped)
+        };
+    }
+    found
+}
+
+/// A search for values of one member at which the simulation jumps.
+struct Stepping<'a, 'b, 'p> {
+    aim: Aim<'a, 'b>,
+    /// The simulation up to the member.
+    begun: Begun<'b>,
+    member: usize,
+    here: &'p mut Point,
+    cost: f64,
+}
+
+impl Stepping<'_, '_, '_> {
+    fn values(&self) -> &[f64] {
+        &self.here.model.members[self.member].values
+    }
+
+    /// Goes to other values if they cost less.
+    fn goes_to(&mut self, values: Vec<f64>) -> bool {
+        let bench = self.aim.bench;
+        let mut moved = self.here.model.clone();
+        moved.members[self.member].values = values;
+        let predicted = bench.go_on(&self.begun, &moved);
+        let there = Point::of(bench, moved, predicted);
+        let cost = self.aim.cost(&there.model, &there.residual);
+        let better = cost < self.cost;
         if better {
-            (*model, *predicted, *residual) = (moved, there_predicted, there_residual);
-            *here = there;
+            (*self.here, self.cost) = (there, cost);
         }
         better
-    };
-    let mut found = false;
-    for m in 0..model.members.len() {
-        let effect = model.members[m].effect;
-        let held = model.held.filter(|(member, _)| *member == m);
-        let near =
-            |model: &Model, share: f64| effect.near(&model.members[m].values, &bench.scale, share);
-        let parameters = effect.card().parameters;
-        let stepped = |p: &usize| parameters[*p].search == Search::Stepped && held != Some((m, *p));
-        if !(0..parameters.len()).any(|p| stepped(&p)) {
-            continue;
-        }
-        let begun = bench.begin(model, m);
-        // Where values depend on one another they are moved together.
-        if near(model, 0.0).is_some() {
-            let without = bench.residual(&bench.run(&model.without(m)));
-            let idle = cost(bench, model, &without, sigma, used);
-            // The best of so many choices takes this much of noise.
-            let chance = effect.choices(&bench.scale).max(1.0).ln();
-            let from = if again { COARSE } else { 0 };
-            for (tried, share) in TOGETHER.into_iter().enumerate().skip(from) {
-                // What is no better than chance after the coarse steps is not near a minimum that is.
-                if tried >= COARSE && here > idle - chance {
+    }
+
+    /// Where values depend on one another they are moved together.
+    fn together(&mut self, again: bool) -> bool {
+        let bench = self.aim.bench;
+        let effect = self.here.model.members[self.member].effect;
+        let held = self
+            .here
+            .model
+            .held
+            .filter(|(member, _)| *member == self.member);
+        let without = bench.run(&self.here.model.without(self.member));
+        let idle = self.aim.cost(&self.here.model, &bench.residual(&without));
+        // The best of so many choices takes this much of noise.
+        let chance = effect.choices(&bench.scale).max(1.0).ln();
+        let from = if again { COARSE } else { 0 };
+        let mut found = false;
+        for (tried, share) in TOGETHER.into_iter().enumerate().skip(from) {
+            // What is no better than chance after the coarse steps is not near a minimum that is.
+            if tried >= COARSE && self.cost > idle - chance {
+                break;
+            }
+            for _ in 0..TIMES_TOGETHER {
+                let before = self.cost;
+                let near = effect.near(self.values(), &bench.scale, share);
+                for mut values in near.unwrap_or_default() {
+                    for (p, value) in values.iter_mut().enumerate() {
+                        let (low, high) = effect.bounds(p, &bench.scale);
+                        *value = value.clamp(low, high);
+                    }
+                    if let Some((_, p)) = held {
+                        values[p] = self.values()[p];
+                    }
+                    found |= self.goes_to(values);
+                }
+                if before - self.cost < WORTH {
                     break;
                 }
-                for _ in 0..TIMES_TOGETHER {
-                    let (before, mut better) = (here, false);
-                    for mut values in near(model, share).unwrap_or_default() {
-                        for (p, value) in values.iter_mut().enumerate() {
-                            let (low, high) = effect.bounds(p, &bench.scale);
-                            *value = value.clamp(low, high);
-                        }
-                        if let Some((_, p)) = held {
-                            values[p] = model.members[m].values[p];
-                        }
-                        better |= try_values(model, &mut here, (m, &begun), values);
-                    }
-                    found |= better;
-                    if before - here < WORTH {
-                        break;
-                    }
-                }
             }
-            continue;
         }
-        for p in (0..parameters.len()).filter(stepped) {
+        found
+    }
+
+    /// One parameter after the other.
+    fn alone(&mut self, stepped: &[usize]) -> bool {
+        let bench = self.aim.bench;
+        let effect = self.here.model.members[self.member].effect;
+        let mut found = false;
+        for &p in stepped {
             let (low, high) = effect.bounds(p, &bench.scale);
             for share in SHARES {
                 for _ in 0..TIMES {
                     let better = [1.0, -1.0].into_iter().any(|sign| {
-                        let mut values = model.members[m].values.clone();
+                        let mut values = self.values().to_vec();
                         // A phase may be zero: it moves by shares of its period.
                         let size = if values[p] == 0.0 {
                             values[0]
@@ -784,7 +827,7 @@ fn search_steps(
                             values[p]
                         };
                         values[p] = (values[p] + sign * share * size).clamp(low, high);
-                        try_values(model, &mut here, (m, &begun), values)
+                        self.goes_to(values)
                     });
                     if !better {
                         break;
@@ -793,11 +836,7 @@ fn search_steps(
                 }
             }
         }
-    }
-    if found {
-        descend(bench, model, predicted, residual, sigma, used, None)
-    } else {
-        known
+        found
     }
 }
 
