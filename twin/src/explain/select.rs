@@ -493,7 +493,7 @@ fn small(
     let deviations = bench.deviations(&change);
     if deviations < CERTAIN {
         return Some(format!(
-            "{deviations:.1} standard deviations of what the stated coloured noise does by itself"
+            "{deviations:.1} standard deviations of what the stated noise does by itself"
         ));
     }
     let noise = to / rows;

@@ -284,14 +284,12 @@ impl<'a> Workbench<'a> {
         Some(self.problem.noise.powi(2) * energy + 2.0 * coloured.rms.powi(2) * together)
     }
 
-    /// How many standard deviations a fitted change is away from what the stated coloured noise does by itself: its projection
-    /// on the change has the variance `cᵀΣc`. Infinite if none is stated.
+    /// How many standard deviations a fitted change is away from what the stated noise does by itself: its projection on the
+    /// change has the variance `cᵀΣc`. Infinite if none is stated.
     pub fn deviations(&self, change: &[f64]) -> f64 {
         let energy: f64 = change.iter().map(|c| c * c).sum();
-        match self.carried(0, change) {
-            Some(variance) => energy / variance.max(1e-300).sqrt(),
-            None => f64::INFINITY,
-        }
+        let white = self.problem.noise.powi(2) * energy;
+        energy / self.carried(0, change).unwrap_or(white).sqrt()
     }
 
     /// The simulation at the rows that count.
