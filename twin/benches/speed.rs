@@ -25,6 +25,8 @@ fn main() {
 const EVALUATED: usize = 3600;
 /// Samples of an explanation.
 const EXPLAINED: usize = 6000;
+/// Samples of a long one: three hours at 10 Hz.
+const LONG: usize = 108_000;
 /// Samples of a simulation.
 const SIMULATED: usize = 1_000_000;
 /// Noise of a reading, in A.
@@ -202,6 +204,20 @@ fn explain_6000_samples(bencher: Bencher<'_, '_>, name: &str) {
     let (_, view, effects) = MODELS.iter().find(|(known, _, _)| *known == name).unwrap();
     let problem = problem(EXPLAINED, *view, effects);
     bencher.counter(ItemsCount::new(EXPLAINED)).bench_local(|| {
+        explain(
+            black_box(std::slice::from_ref(&problem)),
+            &[],
+            &Options::default(),
+            &mut |_, _| {},
+        )
+    });
+}
+
+#[divan::bench(args = [0, 1, 3], sample_count = 1, sample_size = 1)]
+fn explain_three_hours(bencher: Bencher<'_, '_>, concealed: usize) {
+    let effects: Effects = &[("offset", &[0.8]), ("gain", &[1.01]), ("delay", &[0.05])];
+    let problem = problem(LONG, View::Sensor, &effects[..concealed]);
+    bencher.counter(ItemsCount::new(LONG)).bench_local(|| {
         explain(
             black_box(std::slice::from_ref(&problem)),
             &[],

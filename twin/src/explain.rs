@@ -40,12 +40,14 @@ const LOUD: f64 = 1.3;
 /// Where no noise is stated, a mismatch is more than noise with a memory from this multiple of its jumps on.
 const SLOW: f64 = 10.0;
 /// Where no effect passes, loudness is judged by this share of the residual's sizes, which is so many standard deviations of a
-/// normal distribution: single readings at wrong moments are no unknown physics.
+/// normal distribution: a few readings do not make a loud recording. Those have a question of their own, [`STRAY`].
 const COMMON: (f64, f64) = (0.8, 1.2816);
 /// Times the stated noise that noise never is.
 const STRAY: f64 = 8.0;
 /// Fewer readings beyond it are not told from a slip of the log.
 const STRAYS: usize = 2;
+/// Those readings are the mismatch if they make this share of its energy.
+const STRAYED: f64 = 0.5;
 /// From this correlation on, what is left sits where the named effects act: their shape is wrong.
 const ALIKE: f64 = 0.35;
 /// From this ratio of what is left explainable to what the named effects explain on, their names are not to be trusted: another
@@ -717,18 +719,13 @@ fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
     if noise <= 0.0 {
         return None;
     }
-    let known = bench.problem.accuracy;
     let sizes: Vec<f64> = (0..bench.len())
-        .filter(|&row| {
-            let moved = known.moment_s * bench.slope_per_s(row).abs();
-            let accurate = known.zero + known.gain * bench.plain[row].abs() + moved;
-            residual[row].abs() > STRAY * noise + accurate
-        })
+        .filter(|&row| residual[row].abs() > STRAY * noise + bench.accuracy(row))
         .map(|row| residual[row].abs())
         .collect();
     let energy: f64 = sizes.iter().map(|size| size * size).sum();
     let all: f64 = residual.iter().map(|r| r * r).sum();
-    (sizes.len() >= STRAYS && energy > 0.5 * all).then(|| Strays {
+    (sizes.len() >= STRAYS && energy > STRAYED * all).then(|| Strays {
         count: sizes.len(),
         largest: sizes.iter().fold(0.0, |most, size| most.max(*size)),
     })

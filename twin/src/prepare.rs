@@ -320,7 +320,10 @@ impl Work<'_> {
             alignment_s: sensor.alignment_s,
             ..SensorBase::default()
         };
-        let mut slack_s = 0.0;
+        let slack_s = match board {
+            Some(board) if pace == Pace::Seen => board.slack_s(&observed),
+            _ => 0.0,
+        };
         if let Some(board) = board {
             base.step = board.step_a();
             base.full_scale = Some(board.full_scale_a());
@@ -332,9 +335,6 @@ impl Work<'_> {
                 earlier.t_s.iter_mut().for_each(|t| *t -= age_s);
                 board.run(&drive, sensor.held_reference, &earlier, pace, false)
             };
-            if pace == Pace::Seen {
-                slack_s = board.slack_s(&observed);
-            }
             let (_, reported) = phase::closest(sensor.age_s, (slack_s, PHASES), &observed, run);
             self.compare_range_flag(board, &mut drive, &observed, &reported.range_high);
             base.reading = reported.current_a;
@@ -370,6 +370,7 @@ impl Work<'_> {
             accuracy: Accuracy {
                 zero: sensor.accuracy.zero,
                 gain: sensor.accuracy.gain,
+                // The width, to either side.
                 moment_s: 0.5 * slack_s,
             },
         };

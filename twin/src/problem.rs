@@ -160,6 +160,13 @@ pub struct Accuracy {
     pub moment_s: f64,
 }
 
+impl Accuracy {
+    /// By how much a reading may be off that changes by `slope_per_s` in a second, in the view's unit.
+    pub fn at(self, reading: f64, slope_per_s: f64) -> f64 {
+        self.zero + self.gain * reading.abs() + self.moment_s * slope_per_s.abs()
+    }
+}
+
 impl Problem {
     /// Whether time means nothing in this recording.
     pub fn quasi_static(&self) -> bool {

@@ -382,21 +382,26 @@ fn simulating_needs_nothing_but_the_drive() {
     );
 }
 
-/// Rows of 10 ms see a conversion up to 10 ms late; the conversions themselves come evenly.
+/// A current that swings by 200 A at 2 rad/s (283 A/s rms), at rows of 10 ms.
+fn swinging(rows: usize) -> Drive {
+    let t_s: Vec<f64> = (0..rows).map(|k| k as f64 * 0.01).collect();
+    Drive {
+        reference: t_s.iter().map(|t| 200.0 * (2.0 * t).sin()).collect(),
+        segments: std::iter::once(0..rows).collect(),
+        continues: vec![false],
+        t_s,
+        ..Drive::default()
+    }
+}
+
 /// How far from the board's readings they are that are told from the rows that saw them, in A, where each conversion ends at
-/// `ends_s` times the period instead of at its number of times.
+/// `ends` of its number times the period.
 fn apart_where_conversions_wander(ends: impl Fn(f64) -> f64) -> f64 {
     let board = Board::new(FrontEndKind::Hah1bv, 1).unwrap();
-    // As single conversions follow one another: not a part of the step between rows.
+    // 32.5 ms, as the firmware's single conversions follow one another.
     let period_s = 1.04 * board.conversion_s();
-    let t_s: Vec<f64> = (0..9000).map(|k| f64::from(k) * 0.01).collect();
-    let drive = Drive {
-        reference: t_s.iter().map(|t| 200.0 * (2.0 * t).sin()).collect(),
-        segments: vec![0..9000],
-        continues: vec![false],
-        t_s: t_s.clone(),
-        ..Drive::default()
-    };
+    let drive = swinging(9000);
+    let t_s = drive.t_s.clone();
     let ended: Vec<f64> = (1..)
         .map(|number| ends(f64::from(number)) * period_s)
         .take_while(|end_s| *end_s < 89.9)
@@ -434,18 +439,13 @@ fn conversions_may_wander() {
     assert!(even < open_a && wander < open_a, "{even} {wander}");
 }
 
+/// Rows of 10 ms see a conversion up to 10 ms late; the conversions themselves come evenly.
 #[test]
 fn conversions_are_even_though_rows_see_them_late() {
     let board = Board::new(FrontEndKind::Hah1bv, 1).unwrap();
     let period_s = board.conversion_s();
-    let t_s: Vec<f64> = (0..6000).map(|k| f64::from(k) * 0.01).collect();
-    let drive = Drive {
-        reference: t_s.iter().map(|t| 200.0 * (2.0 * t).sin()).collect(),
-        segments: vec![0..6000],
-        continues: vec![false],
-        t_s: t_s.clone(),
-        ..Drive::default()
-    };
+    let drive = swinging(6000);
+    let t_s = drive.t_s.clone();
     let rows = observed(t_s.clone());
     let free = board.run(&drive, false, &rows, Pace::Free, false).current_a;
     let mut seen = rows.clone();

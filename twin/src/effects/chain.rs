@@ -68,6 +68,18 @@ pub enum Change {
     Alignment,
 }
 
+/// The first link at which a change tells.
+fn first(links: &[Link<'_>], change: Change) -> usize {
+    let tells = |link: &Link<'_>| match (change, link) {
+        (Change::Member(index), Link::Effect(_, _, member)) => *member == Some(index),
+        (Change::SocShift, Link::Count)
+        | (Change::Resistance, Link::Terminals)
+        | (Change::Alignment, Link::Sample) => true,
+        _ => false,
+    };
+    links.iter().position(tells).unwrap_or_default()
+}
+
 /// A run that differs from another: by what, and the members and the nuisance with it.
 pub type Variation<'m> = (Change, Vec<(&'static dyn Effect, &'m [f64])>, Nuisance);
 
@@ -129,24 +141,39 @@ impl<'a> Chain<'a> {
     /// The simulation up to a member, to be gone on with for many values of it.
     pub fn begin(&self, members: &Members<'_>, nuisance: Nuisance, index: usize) -> Begun<'a> {
         let links = self.links(members);
-        let here =
-            |link: &Link<'_>| matches!(link, Link::Effect(_, _, Some(member)) if *member == index);
-        let done = links.iter().position(here).unwrap_or_default();
-        let mut scene = self.start.clone();
-        for link in &links[..done] {
-            self.apply(&mut scene, *link, nuisance);
+        let mut begun = self.begun();
+        self.advance(
+            &mut begun,
+            &links,
+            first(&links, Change::Member(index)),
+            nuisance,
+        );
+        begun
+    }
+
+    /// A simulation of which nothing was run.
+    fn begun(&self) -> Begun<'a> {
+        Begun {
+            scene: self.start.clone(),
+            done: 0,
         }
-        Begun { scene, done }
+    }
+
+    /// Runs links up to one.
+    fn advance(&self, begun: &mut Begun<'a>, links: &[Link<'_>], to: usize, nuisance: Nuisance) {
+        for link in &links[begun.done..to] {
+            self.apply(&mut begun.scene, *link, nuisance);
+        }
+        begun.done = to;
     }
 
     /// The rest of it: what the simulation says at each observed row. The members are those that it was begun with; the
     /// values may differ of the one up to which it was begun.
     pub fn go_on(&self, begun: &Begun<'a>, members: &Members<'_>, nuisance: Nuisance) -> Vec<f64> {
-        let mut scene = begun.scene.clone();
-        for link in &self.links(members)[begun.done..] {
-            self.apply(&mut scene, *link, nuisance);
-        }
-        scene.signal
+        let links = self.links(members);
+        let mut begun = begun.clone();
+        self.advance(&mut begun, &links, links.len(), nuisance);
+        begun.scene.signal
     }
 
     /// What variations of a simulation say, each through `take`: what comes before a change is run once for all of them.
@@ -160,33 +187,16 @@ impl<'a> Chain<'a> {
         let links = self.links(members);
         let first: Vec<usize> = variations
             .iter()
-            .map(|(change, _, _)| {
-                let tells = |link: &Link<'_>| match (change, link) {
-                    (Change::Member(index), Link::Effect(_, _, member)) => *member == Some(*index),
-                    (Change::SocShift, Link::Count)
-                    | (Change::Resistance, Link::Terminals)
-                    | (Change::Alignment, Link::Sample) => true,
-                    _ => false,
-                };
-                links.iter().position(tells).unwrap_or_default()
-            })
+            .map(|(change, _, _)| self::first(&links, *change))
             .collect();
         let mut order: Vec<usize> = (0..variations.len()).collect();
         order.sort_by_key(|k| first[*k]);
         let mut outputs = vec![Vec::new(); variations.len()];
-        let mut scene = self.start.clone();
-        let mut done = 0;
+        let mut begun = self.begun();
         for k in order {
-            for link in &links[done..first[k]] {
-                self.apply(&mut scene, *link, nuisance);
-            }
-            done = first[k];
+            self.advance(&mut begun, &links, first[k], nuisance);
             let (_, members, nuisance) = &variations[k];
-            let mut varied = scene.clone();
-            for link in &self.links(members)[done..] {
-                self.apply(&mut varied, *link, *nuisance);
-            }
-            outputs[k] = take(varied.signal);
+            outputs[k] = take(self.go_on(&begun, members, *nuisance));
         }
         outputs
     }

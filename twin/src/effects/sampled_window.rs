@@ -140,13 +140,15 @@ impl Effect for SampledWindow {
                         known = ended;
                         let from = start + ended * period;
                         let to = from + duty * period;
-                        // The mean over a straight line is its value in the middle.
-                        value = end.value(&scene.signal, 0.5 * (from + to), held);
-                        if !(end.shares(from) && end.shares(to)) {
+                        // The mean over a straight line is its value in the middle: most windows below a row are within one.
+                        let middle = end.value(&scene.signal, 0.5 * (from + to), held);
+                        value = if end.in_step(from) && end.in_step(to) {
+                            middle
+                        } else {
                             let before = begin.integral(&total, &scene.signal, from, held);
                             let after = end.integral(&total, &scene.signal, to, held);
-                            value = (after - before) / (duty * period);
-                        }
+                            (after - before) / (duty * period)
+                        };
                     }
                 }
                 *out = value;

@@ -488,7 +488,7 @@ impl<'a> Cursor<'a> {
 
     /// Whether a time is in the step that begins at the row where the cursor stands.
     #[inline]
-    pub fn shares(&self, t: f64) -> bool {
+    pub fn in_step(&self, t: f64) -> bool {
         t >= self.t_s[self.at] && self.at + 1 < self.rows.end && t <= self.t_s[self.at + 1]
     }
 }

@@ -221,8 +221,15 @@ impl<'a> Workbench<'a> {
         self.rows.len()
     }
 
+    /// By how much reference and time stamps may be off at a row, in the view's unit.
+    pub fn accuracy(&self, row: usize) -> f64 {
+        self.problem
+            .accuracy
+            .at(self.plain[row], self.slope_per_s(row))
+    }
+
     /// How fast the simulation as designed changes up to a row, in the view's unit per second; 0 at the first one.
-    pub fn slope_per_s(&self, row: usize) -> f64 {
+    fn slope_per_s(&self, row: usize) -> f64 {
         let Some(before) = row.checked_sub(1) else {
             return 0.0;
         };

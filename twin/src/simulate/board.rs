@@ -38,13 +38,17 @@ const GRID_LIKE: f64 = 0.85;
 /// Changes to either side that tell the phase of the grid at one: each is late by up to a step between rows, so that their mean is
 /// known to a thirtieth of a step.
 const AROUND: usize = 40;
+/// Rows that are further apart than this part of the grid's period saw two conversions.
+const ANOTHER: f64 = 0.5;
+/// The second of them ends no sooner than this part of it after the first: the phase moves by less than the rest.
+const SOONEST: f64 = 0.75;
 /// The ADS1100's clock may be off by a fifth (*assumed*, as `core-logic` has it).
 const CLOCK_WITHIN: f64 = 0.2;
 
 /// When conversions end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pace {
-    /// Where a new reading was seen: at the valid rows of the observation, or rather on the even grid that those tell
+    /// Where a new reading was seen: at the valid rows of the observation, or rather on the grid that those tell
     /// of, since a row sees a conversion up to one step late.
     Seen,
     /// Rows are further apart than conversions: half a conversion before each row, the mean of what can be.
@@ -200,7 +204,7 @@ impl Board {
         charge.get() as f64 * 1e-9
     }
 
-    /// How closely the rows tell the time of the conversions on whose even grid they are placed, in s; 0 where they are placed
+    /// How closely the rows tell the time of the conversions on whose grid they are placed, in s; 0 where they are placed
     /// at the rows themselves.
     ///
     /// Each row is late by up to a step. Where the two periods have a common multiple, only a few latenesses occur, and the
@@ -439,9 +443,9 @@ fn ends(observed: &Observed, rows: std::ops::Range<usize>, period_s: f64) -> Vec
                         start_s + ((t - start_s + early_s) / grid_s + 1e-6).floor() * grid_s;
                     // Where the phase moves, two rows that saw a conversion each could seem to see the same.
                     if let Some((row_s, before_s)) = last
-                        && t - row_s > 0.5 * grid_s
+                        && t - row_s > ANOTHER * grid_s
                     {
-                        end_s = end_s.max(t.min(before_s + 0.75 * grid_s));
+                        end_s = end_s.max(t.min(before_s + SOONEST * grid_s));
                     }
                     last = Some((t, end_s));
                     end_s
