@@ -24,14 +24,15 @@ LONGEST_STEADY_S = 120.0
 
 @dataclasses.dataclass(frozen=True)
 class Stretch:
-    """A stretch of a drive with everything that a sensor meets; all series have a row each, `range_fine` FINE to a row.
+    """A stretch of a drive with everything that a sensor meets; all series have a row each.
 
     Attributes
     ----------
     step_s : time between rows in s; the first row is at 0 s.
     current_a : true current in A, positive = discharge.
     temp_c, supply_v, aux_a : the sensor's temperature in °C, supply in V, and current of a neighbouring conductor in A.
-    range_fine : True where the large range measures.
+    starts_high : whether the large range measures at first.
+    changes_s : times in s of the changes of range, in order.
     """
 
     step_s: float
@@ -39,7 +40,8 @@ class Stretch:
     temp_c: np.ndarray
     supply_v: np.ndarray
     aux_a: np.ndarray
-    range_fine: np.ndarray
+    starts_high: bool
+    changes_s: np.ndarray
 
     @property
     def rows(self) -> int:
@@ -54,7 +56,7 @@ class Stretch:
     @property
     def range_high(self) -> np.ndarray:
         """The range flag at the rows, 0 or 1."""
-        return self.range_fine[::FINE].astype(float)
+        return (np.searchsorted(self.changes_s, self.t_s, side="right") + self.starts_high) % 2.0
 
 
 def stream(case: dict, purpose: str) -> np.random.Generator:
@@ -77,11 +79,22 @@ def fine_grid(series: np.ndarray) -> np.ndarray:
     return np.interp(np.arange((len(series) - 1) * FINE + 1) / FINE, rows, series)
 
 
-def range_of(current_a: np.ndarray) -> np.ndarray:
-    """True where the large range measures: beyond HIGH_A, and until below LOW_A."""
-    size = np.abs(current_a)
-    known = np.where((size > HIGH_A) | (size < LOW_A), np.arange(len(size)), 0)
-    return size[np.maximum.accumulate(known)] > HIGH_A
+def range_of(current_a: np.ndarray, step_s: float) -> tuple[bool, np.ndarray]:
+    """Whether the large range measures at first, and the times in s at which the range changes.
+
+    The comparators see straight lines between rows: up beyond HIGH_A, down below LOW_A, at the crossings themselves.
+    """
+    high = starts_high = bool(abs(current_a[0]) > HIGH_A)
+    changes = []
+    for row, (begin, end) in enumerate(zip(current_a[:-1].tolist(), current_a[1:].tolist())):
+        # A line through zero goes down and may go up again.
+        if high and (begin * end < 0.0 or abs(end) < LOW_A):
+            changes.append((row + (np.copysign(LOW_A, begin) - begin) / (end - begin)) * step_s)
+            high = False
+        if not high and abs(end) > HIGH_A:
+            changes.append((row + (np.copysign(HIGH_A, end) - begin) / (end - begin)) * step_s)
+            high = True
+    return starts_high, np.array(changes)
 
 
 @functools.cache
@@ -172,8 +185,8 @@ def stretches(case: dict) -> tuple[Stretch, Stretch]:
             around[name] = np.full(2 * rows, value)
 
     def stretch(part: slice) -> Stretch:
-        flag = range_of(fine_grid(current_a[part]))
-        flag |= "range" in constant
-        return Stretch(step_s, current_a[part], **{name: series[part] for name, series in around.items()}, range_fine=flag)
+        starts_high, changes_s = (True, np.array([])) if "range" in constant else range_of(current_a[part], step_s)
+        return Stretch(step_s, current_a[part], **{name: series[part] for name, series in around.items()},
+                       starts_high=starts_high, changes_s=changes_s)
 
     return stretch(slice(0, rows)), stretch(slice(rows, 2 * rows))

@@ -99,23 +99,27 @@ def range_mismatch(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarra
 def range_handover(y: np.ndarray, values: Values, stretch: Stretch) -> np.ndarray:
     """The multiplier's low-pass keeps the product in the old range's scale.
 
-    On the fine grid, changes midway between its points. The product's error decays between changes; at a change what the
-    low-pass holds is read in the new scale.
+    On the fine grid, changes where they are. The product's error decays between changes; at a change what the low-pass holds
+    is read in the new scale.
     """
     step_s, tau_s = stretch.step_s / FINE, values["tau_s"]
     held = low_pass(y, step_s, tau_s)
-    large = stretch.range_fine
-    after = np.arange(len(y)) * step_s / tau_s
+    times_s = fine_times(stretch)
+    rows = np.searchsorted(times_s, stretch.changes_s)
     error = np.zeros(len(y))
-    now = began = 0.0
-    changes = np.flatnonzero(np.diff(large)) + 1
-    for change, end in zip(changes, [*changes[1:], len(y)]):
-        begins = (change - 0.5) * step_s / tau_s
-        now *= np.exp(began - begins)
-        held_then = 0.5 * (held[change - 1] + held[change])
-        factor = RANGE_RATIO if large[change] else 1.0 / RANGE_RATIO
-        now, began = factor * (now + held_then) - held_then, begins
-        error[change:end] = now * np.exp(began - after[change:end])
+    now = began_s = 0.0
+    high = stretch.starts_high
+    for row, change_s, end in zip(rows, stretch.changes_s, [*rows[1:], len(y)]):
+        high = not high
+        # Exact on the straight line from the point before the change to the one after it.
+        since_s = change_s - times_s[row - 1]
+        slope = (y[row] - y[row - 1]) / step_s
+        lagging = held[row - 1] - y[row - 1] + slope * tau_s
+        held_then = y[row - 1] + slope * (since_s - tau_s) + lagging * np.exp(-since_s / tau_s)
+        now *= np.exp((began_s - change_s) / tau_s)
+        now = (RANGE_RATIO if high else 1.0 / RANGE_RATIO) * (now + held_then) - held_then
+        began_s = change_s
+        error[row:end] = now * np.exp((change_s - times_s[row:end]) / tau_s)
     return y + error
 
 
