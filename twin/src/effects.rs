@@ -271,6 +271,11 @@ pub trait Effect: Sync {
         false
     }
 
+    /// Whether a parameter is a level at which readings stay.
+    fn level(&self, _parameter: usize) -> bool {
+        false
+    }
+
     /// The value of a parameter from which on it does what a simpler effect does (a time longer than the recording): the effect is
     /// not named then, but an equal of what is.
     fn endless(&self, _parameter: usize, _scale: &Scale) -> f64 {

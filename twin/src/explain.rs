@@ -221,7 +221,7 @@ fn one(
         left,
         unavoidable,
     );
-    let (verdict, doubted) = doubt(
+    let (verdict, beside) = doubt(
         &bench,
         &mut selection,
         verdict,
@@ -229,6 +229,7 @@ fn one(
         (confirmed, taken_back),
         unavoidable,
     );
+    let doubted = beside.is_some();
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);
@@ -255,7 +256,9 @@ fn one(
     };
     attribute(&bench, &selection.fit, &mut locations);
     report.locations.extend(locations);
-    report.effects.extend(effects(&bench, &selection));
+    report
+        .effects
+        .extend(effects(&bench, &selection, beside.unwrap_or(0.0)));
     report
         .holdouts
         .extend(others.iter().map(|other| HoldoutReport {
@@ -390,7 +393,7 @@ fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted
 /// values it does tell takes the place.
 fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
     while !selection.named.is_empty() {
-        let intervals = intervals::intervals(bench, &selection.fit);
+        let intervals = intervals::intervals(bench, &selection.fit, 0.0);
         let members = &selection.fit.model.members;
         let found =
             members
@@ -470,7 +473,7 @@ fn stand_in(
             && untold(
                 &bench.scale,
                 member,
-                &intervals::intervals(bench, fit)[last],
+                &intervals::intervals(bench, fit, 0.0)[last],
             )
             .is_none()
             && holds(fit)
@@ -616,7 +619,8 @@ fn judge(
                 "what it changes from reading to reading",
             )
         };
-        return if floor > 0.0 && common > times * floor {
+        let limit = (times * floor).hypot(swing(bench).sqrt());
+        return if floor > 0.0 && common > limit {
             selection.decisions.push(format!(
                 "No effect passes, yet all over the recording the mismatch is {} times {of}: unknown.",
                 short(common / floor)
@@ -655,7 +659,7 @@ fn judge(
     };
     // What is beyond the noise that the design states is structure too, whatever the inputs say of it.
     let allowed = allowed(bench, unavoidable);
-    let beyond = if noise > 0.0 && rest > LOUD * LOUD * allowed {
+    let beyond = if noise > 0.0 && rest > LOUD * LOUD * allowed + swing(bench) * count {
         rest - allowed
     } else {
         0.0
@@ -737,6 +741,17 @@ fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
     unavoidable.max(zero * zero * bench.len() as f64)
 }
 
+/// By how much the mean square of the stated noise that has a memory, in the view's unit squared, can be above the stated one by
+/// chance: over T it has no more than T/2τ independent values (its squares' covariance falls as the square of its own).
+fn swing(bench: &Workbench<'_>) -> f64 {
+    let coloured = bench.problem.coloured;
+    let span_s = match bench.t_s.as_slice() {
+        [first, .., last] if last > first => last - first,
+        _ => return 0.0,
+    };
+    select::CERTAIN * coloured.rms.powi(2) * (2.0 * coloured.tau_s / span_s).sqrt()
+}
+
 /// The verdict once more: names whose values waver, or that leave what follows the inputs, are the best of the library and no
 /// more; and where all names were taken back for that, the mismatch is still there. True if names are doubted.
 fn doubt(
@@ -746,24 +761,26 @@ fn doubt(
     left: Explainable,
     (confirmed, taken_back): (bool, bool),
     unavoidable: f64,
-) -> (Verdict, bool) {
+) -> (Verdict, Option<f64>) {
     if taken_back && verdict == Verdict::NoMismatch {
         selection.decisions.push(
             "There is a mismatch, yet the only effects that take it would have to change in the course of the recording: unknown."
                 .into(),
         );
-        return (Verdict::Unknown, false);
+        return (Verdict::Unknown, None);
     }
     if confirmed || selection.named.is_empty() {
-        return (verdict, false);
+        return (verdict, None);
     }
     let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
     let rest = energy(&selection.fit);
     let explained = (energy(&selection.plain) - rest).max(1e-300);
     let allowed = allowed(bench, unavoidable);
     // What is left beyond the stated noise, if that is stated well enough.
-    let deviation = allowed * (2.0 / bench.len().max(1) as f64).sqrt();
-    let certain = rest > STATED * allowed && rest - allowed > select::CERTAIN * deviation;
+    let count = bench.len().max(1) as f64;
+    let certain = rest > STATED * allowed
+        && rest - allowed
+            > (select::CERTAIN * allowed * (2.0 / count).sqrt()).max(swing(bench) * count);
     let beyond = if bench.problem.noise > 0.0 && certain {
         (rest - allowed) / explained
     } else {
@@ -796,14 +813,15 @@ fn doubt(
     ];
     let doubts: Vec<String> = doubts.into_iter().flatten().collect();
     if doubts.is_empty() {
-        return (verdict, false);
+        return (verdict, None);
     }
     selection.decisions.push(format!(
         "{}: the best of the library, yet {}: another physics of much the same shape may be behind it.",
         selection.fit.model.ids().join(", "),
         doubts.join(", and ")
     ));
-    (Verdict::Ambiguous, true)
+    let share = [wavers, reach, beyond].into_iter().fold(0.0, f64::max);
+    (Verdict::Ambiguous, Some(share * explained))
 }
 
 /// Correlation of the sizes of two series.
@@ -893,8 +911,8 @@ fn unit(problem: &Problem, unit: &str) -> String {
     }
 }
 
-fn effects(bench: &Workbench<'_>, selection: &Selection) -> Vec<EffectReport> {
-    let intervals = intervals::intervals(bench, &selection.fit);
+fn effects(bench: &Workbench<'_>, selection: &Selection, beside: f64) -> Vec<EffectReport> {
+    let intervals = intervals::intervals(bench, &selection.fit, beside);
     selection
         .named
         .iter()

@@ -57,6 +57,10 @@ impl Effect for Clipping {
         true
     }
 
+    fn level(&self, _parameter: usize) -> bool {
+        true
+    }
+
     fn curve(&self) -> f64 {
         BENT
     }

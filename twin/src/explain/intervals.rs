@@ -11,13 +11,14 @@
 //!
 //! Where the loss has a kink in a value (an effect says so, [`crate::effects::Effect::kinked`]) or jumps with it, neither holds:
 //! the value is moved, the others are fitted again, and the interval ends where the loss has risen by what bounds 95 %
-//! (profile likelihood), with as many observations as the noise's memory leaves (Rao and Scott's correction).
+//! (profile likelihood), with as many observations as the noise's memory leaves (Rao and Scott's correction). Rows on which it
+//! jumps count by how far they go to and fro: noise ahead of a threshold carries them over it both ways.
 
 use std::ops::Range;
 
 use nalgebra::{DMatrix, DVector};
 
-use super::fit::{Fit, Slope, change, dot, fit as refit, loss, normal, solve, weights};
+use super::fit::{Fit, Slope, change, dot, fit as refit, huber, loss, normal, solve, weights};
 use super::workbench::{Model, Workbench};
 use crate::effects::{Parameter, Search};
 
@@ -27,6 +28,12 @@ const NORMAL: f64 = 1.96;
 const LEAST_FREEDOM: f64 = 3.0;
 /// Half of χ²'s 95th percentile with one degree of freedom.
 const RISE: f64 = 0.5 * 3.84;
+/// A row whose loss changes by more than this jumped: what the simulation says there changed by two standard deviations.
+const JUMP: f64 = 2.0;
+/// 95th percentile of what loss falls by chance to its least value, in units of the root of the squared jumps between there and the
+/// truth: of a two-sided random walk on a parabola (Chernoff's distribution, as of a threshold that noise crosses both ways), by
+/// 4,000 simulated walks.
+const CHANCE: f64 = 2.5;
 /// Steps to each side when the end of a profile is looked for.
 const OUTWARD: usize = 40;
 /// Halvings that narrow the end down.
@@ -99,8 +106,8 @@ fn inverse(matrix: &DMatrix<f64>) -> DMatrix<f64> {
     inverse
 }
 
-/// How sure each coordinate of a slope is.
-fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope) -> Certainty {
+/// How sure each coordinate of a slope is; `beside` as in [`intervals`].
+fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope, beside: f64) -> Certainty {
     let size = slope.len();
     let weights = weights(&fit.residual, fit.sigma);
     let parts = parts(bench, fit, slope, &weights);
@@ -165,7 +172,8 @@ fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope) -> Certainty {
             most = most.max(student(freedom) * (by_stretches[k] + by_base).sqrt());
             times = times.max(by_stretches[k] / white.max(1e-300));
         }
-        half.push(most);
+        let along = beside / (fit.sigma * fit.sigma) * inverted[(k, k)];
+        half.push(most.hypot(along.sqrt()));
         inflation.push(times.max(1.0));
     }
     Certainty { half, inflation }
@@ -229,9 +237,12 @@ pub fn variations(bench: &Workbench<'_>, fit: &Fit) -> Vec<Variation> {
 }
 
 /// An interval for each parameter of each member.
-pub fn intervals(bench: &Workbench<'_>, fit: &Fit) -> Vec<Vec<[f64; 2]>> {
+///
+/// `beside` is the energy, in the view's unit squared, of what is left beyond noise: another physics, which moves the values by
+/// what of it lies along the effects. That part cannot be seen; it is taken to be as large as the part beside them, which can.
+pub fn intervals(bench: &Workbench<'_>, fit: &Fit, beside: f64) -> Vec<Vec<[f64; 2]>> {
     let slope = fit.slope(bench);
-    let certainty = certainty(bench, fit, &slope);
+    let certainty = certainty(bench, fit, &slope, beside);
     fit.model
         .members
         .iter()
@@ -250,8 +261,17 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit) -> Vec<Vec<[f64; 2]>> {
                         }
                         let times = at.map_or(1.0, |k| certainty.inflation[k]);
                         let half = at.map(|k| certainty.half[k]);
-                        return [-1.0, 1.0]
-                            .map(|sign| profile(bench, fit, (m, p), parameter, sign, times, half));
+                        let rise = RISE * times + 0.5 * beside / (fit.sigma * fit.sigma);
+                        // Readings that stay at a level all fall on one step of the converter.
+                        let by_step = if member.effect.level(p) {
+                            0.5 * bench.scale.quantum
+                        } else {
+                            0.0
+                        };
+                        return [-1.0, 1.0].map(|sign| {
+                            let end = profile(bench, fit, (m, p), parameter, sign, rise, half);
+                            value + sign * (end - value).hypot(by_step)
+                        });
                     }
                     let Some(k) = at else {
                         return [value, value];
@@ -277,7 +297,7 @@ fn profile(
     (member, parameter): (usize, usize),
     card: &Parameter,
     sign: f64,
-    inflation: f64,
+    rise: f64,
     half: Option<f64>,
 ) -> f64 {
     let value = fit.model.members[member].values[parameter];
@@ -287,22 +307,35 @@ fn profile(
     // What is left may be louder or quieter than the spread that the loss is told in.
     let here = loss(&fit.residual, fit.sigma);
     let loudness = 2.0 * here / fit.residual.len().max(1) as f64;
-    let limit = here + RISE * inflation * loudness.max(0.1);
+    let limit = here + rise * loudness.max(0.1);
+    let beyond = |residual: &[f64]| {
+        let jumps = fit
+            .residual
+            .iter()
+            .zip(residual)
+            .map(|(best, there)| huber(there / fit.sigma) - huber(best / fit.sigma));
+        let jumped: f64 = jumps
+            .filter(|jump| jump.abs() > JUMP)
+            .map(|jump| jump * jump)
+            .sum();
+        let risen = loss(residual, fit.sigma);
+        risen > limit && risen > here + CHANCE * jumped.sqrt()
+    };
     let risen = |there: f64| {
         let mut model = fit.model.clone();
         model.members[member].values[parameter] = there;
         let others_free = model.members.iter().any(|m| m.values.len() > 1)
             || model.members.len() > 1
             || bench.aligns(&model);
-        let fixed = loss(&bench.residual(&bench.run(&model)), fit.sigma);
-        if fixed <= limit || !others_free {
-            return fixed > limit;
+        let fixed = beyond(&bench.residual(&bench.run(&model)));
+        if !fixed || !others_free {
+            return fixed;
         }
         let model = Model {
             held: Some((member, parameter)),
             ..model
         };
-        loss(&refit(bench, &model, None).residual, fit.sigma) > limit
+        beyond(&refit(bench, &model, None).residual)
     };
     let size = match card.search {
         Search::Linear | Search::Smooth => (high - low).abs().min(1e6 * value.abs().max(1e-6)),
@@ -435,7 +468,7 @@ mod tests {
                 ..Model::default()
             };
             let fit = refit(&bench, &model, None);
-            for (m, interval) in intervals(&bench, &fit).iter().enumerate() {
+            for (m, interval) in intervals(&bench, &fit, 0.0).iter().enumerate() {
                 let [low, high] = interval[0];
                 covered[m] += f64::from(u8::from((low..=high).contains(&TRUTH[m].1)));
             }
