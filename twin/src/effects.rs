@@ -260,6 +260,11 @@ pub trait Effect: Sync {
         false
     }
 
+    /// Whether it is general enough to follow any process of its kind, so that a fit is no proof of this one.
+    fn general(&self) -> bool {
+        false
+    }
+
     /// Share of its own change by which its equation may be off: most are idealisations of what happens.
     fn idealised(&self) -> f64 {
         IDEALISED

@@ -221,11 +221,12 @@ fn one(
         left,
         unavoidable,
     );
+    let held = folds(&bench, &selection.fit);
     let (verdict, beside) = doubt(
         &bench,
         &mut selection,
         verdict,
-        left,
+        (left, &held),
         (confirmed, taken_back),
         unavoidable,
     );
@@ -233,7 +234,7 @@ fn one(
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);
-    let (held_before, held_after, held_residual) = folds(&bench, &selection.fit);
+    let (held_before, held_after, held_residual) = held;
     let noise = if problem.noise > 0.0 {
         problem.noise
     } else {
@@ -758,7 +759,7 @@ fn doubt(
     bench: &Workbench<'_>,
     selection: &mut Selection,
     verdict: Verdict,
-    left: Explainable,
+    (left, held): (Explainable, &(f64, f64, Vec<f64>)),
     (confirmed, taken_back): (bool, bool),
     unavoidable: f64,
 ) -> (Verdict, Option<f64>) {
@@ -791,7 +792,30 @@ fn doubt(
         .into_iter()
         .filter(|variation| variation.deviations > select::CERTAIN)
         .fold(0.0f64, |most, variation| most.max(variation.share));
+    // Values that are found in a part of the recording have to do in the other part.
+    let (mut here, mut there) = (0.0, 0.0);
+    for (own, other) in selection.fit.residual.iter().zip(&held.2) {
+        if other.is_finite() {
+            here += own * own;
+            there += other * other;
+        }
+    }
+    let carried = (there - here).max(0.0) / explained;
+    let members = &selection.fit.model.members;
+    let general = members.iter().find(|member| member.effect.general());
     let doubts = [
+        general.map(|member| {
+            format!(
+                "with so many values {} follows any process of its kind",
+                member.id()
+            )
+        }),
+        (carried > DOUBTED && there > STATED * here).then(|| {
+            format!(
+                "its values from one part of the recording miss the other by {} of its change",
+                percent(carried.sqrt())
+            )
+        }),
         (wavers > DOUBTED).then(|| {
             format!(
                 "its values would have to differ by {} from stretch to stretch",
@@ -820,7 +844,9 @@ fn doubt(
         selection.fit.model.ids().join(", "),
         doubts.join(", and ")
     ));
-    let share = [wavers, reach, beyond].into_iter().fold(0.0, f64::max);
+    let share = [carried, wavers, reach, beyond]
+        .into_iter()
+        .fold(0.0, f64::max);
     (Verdict::Ambiguous, Some(share * explained))
 }
 
@@ -1032,7 +1058,7 @@ fn sentence(
             }
         ),
         Verdict::Ambiguous if doubted => format!(
-            "{name}: explained best by {} ({figures}), but not certainly: more is left than noise leaves.",
+            "{name}: explained best by {} ({figures}), but not certainly: another physics of much the same shape may be behind it.",
             ids.join(" and ")
         ),
         Verdict::Ambiguous => format!(

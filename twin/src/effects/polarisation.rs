@@ -81,6 +81,11 @@ impl Effect for Polarisation {
         2.0 * IDEALISED
     }
 
+    /// Of several branches every slow voltage without overshoot can be made.
+    fn general(&self) -> bool {
+        self.card.parameters.len() > 2
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (drive, steps) = (scene.drive, scene.steps.clone());
         let Some(battery) = &mut scene.battery else {
