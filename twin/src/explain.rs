@@ -19,7 +19,7 @@ use std::time::Instant;
 use crate::effects::chain::{Chain, Nuisance};
 use crate::effects::scene::Scale;
 use crate::effects::{Effect, IDEALISED, Search, Stage, find, find_with};
-use crate::problem::Problem;
+use crate::problem::{Base, Problem};
 use crate::report::data::{
     EffectReport, FittedModel, HoldoutReport, Location, ParameterReport, Report, SignalPlots,
     SignalReport, Unexplained, Verdict,
@@ -55,9 +55,8 @@ const ALIKE: f64 = 0.35;
 const DOUBTFUL: f64 = 0.12;
 /// Below this ratio it is traces, wherever they sit: even a true effect's equation is a model.
 const TRACES: f64 = 0.05;
-/// An effect whose values would have to differ from stretch to stretch by so many times what its equation may be off by (14 % of it,
-/// rms; 28 % of a branch, whose resistance follows the state of charge) is not what is there: true ones of other people's cells
-/// stay below.
+/// An effect whose values would have to differ from stretch to stretch by so many times what equations may be off by (14 % of it,
+/// rms, of a sensor's; 28 % of a battery's) is not what is there: true ones of other people's circuits and cells stay below.
 const WAVERS: f64 = 2.8;
 /// From this share on (5 % rms, as much as an idealised equation may be off) the name is doubted: another physics of much the same
 /// shape could be behind it. The same where so much of what the effects take is left within reach of the inputs, or beyond the
@@ -354,8 +353,13 @@ fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>
 }
 
 /// Whether values would have to differ from stretch to stretch by more than noise makes them, and by much.
-fn waver(member: &Member, variation: &Variation) -> bool {
-    let rough = member.effect.idealised().max(IDEALISED);
+fn waver(bench: &Workbench<'_>, member: &Member, variation: &Variation) -> bool {
+    // Without relaxation and charge transfer the battery as designed is rougher than a sensor.
+    let base = match bench.problem.base {
+        Base::Sensor(_) => IDEALISED,
+        Base::Battery(_) => 2.0 * IDEALISED,
+    };
+    let rough = member.effect.idealised().max(base);
     variation.deviations > select::CERTAIN && variation.share > (WAVERS * rough).powi(2)
 }
 
@@ -368,7 +372,7 @@ fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted
         let found = intervals::variations(bench, &selection.fit)
             .into_iter()
             .enumerate()
-            .filter(|(index, variation)| waver(&members[*index], variation))
+            .filter(|(index, variation)| waver(bench, &members[*index], variation))
             .max_by(|a, b| a.1.share.total_cmp(&b.1.share));
         let Some((index, variation)) = found else {
             break;
@@ -382,7 +386,7 @@ fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted
         let steady = |fit: &Fit| {
             let last = intervals::variations(bench, fit);
             let last = last.last().zip(fit.model.members.last());
-            last.is_some_and(|(variation, member)| !waver(member, variation))
+            last.is_some_and(|(variation, member)| !waver(bench, member, variation))
         };
         replace(bench, selection, index, "its values stay", &steady);
         any = true;
@@ -950,12 +954,18 @@ fn effects(bench: &Workbench<'_>, selection: &Selection, beside: f64) -> Vec<Eff
                 .iter()
                 .enumerate()
                 .filter(|(_, parameter)| !parameter.internal)
-                .map(|(p, parameter)| ParameterReport {
-                    name: parameter.name.to_owned(),
-                    value: member.values[p],
-                    ci95: intervals[named.index][p],
-                    off: Some(parameter.off).filter(|off| off.is_finite()),
-                    unit: unit(bench.problem, parameter.unit),
+                .map(|(p, parameter)| {
+                    let value = member.values[p];
+                    let [from, to] = intervals[named.index][p];
+                    // What has no sign has none in its interval; other bounds are those of the search.
+                    let unsigned = member.effect.bounds(p, &bench.scale).0 == 0.0 && value >= 0.0;
+                    ParameterReport {
+                        name: parameter.name.to_owned(),
+                        value,
+                        ci95: [if unsigned { from.max(0.0) } else { from }, to],
+                        off: Some(parameter.off).filter(|off| off.is_finite()),
+                        unit: unit(bench.problem, parameter.unit),
+                    }
                 })
                 .collect();
             let separated: Vec<&str> = named
