@@ -233,7 +233,6 @@ fn one(
     let model = &selection.fit.model;
 
     let plain_residual = bench.residual(&bench.plain);
-    let (held_before, held_after, held_residual) = held;
     let noise = if problem.noise > 0.0 {
         problem.noise
     } else {
@@ -245,8 +244,8 @@ fn one(
         noise_floor: noise,
         rmse_before: rms(plain_residual.iter().copied()),
         rmse_after: rms(selection.fit.residual.iter().copied()),
-        held_out_blocks_before: held_before,
-        held_out_blocks_after: held_after,
+        held_out_blocks_before: held.before,
+        held_out_blocks_after: held.after,
         samples: bench.len(),
     });
     let mut locations = if verdict == Verdict::NoMismatch {
@@ -281,7 +280,7 @@ fn one(
     report.models.push(fitted(problem, &selection.fit));
     report
         .plots
-        .push(plots(&bench, &selection.fit, &held_residual));
+        .push(plots(&bench, &selection.fit, &held.residual));
     let sentence = sentence(&bench, &selection, (verdict, doubted), left, report);
     Part {
         verdict,
@@ -758,12 +757,13 @@ fn swing(bench: &Workbench<'_>) -> f64 {
 }
 
 /// The verdict once more: names whose values waver, or that leave what follows the inputs, are the best of the library and no
-/// more; and where all names were taken back for that, the mismatch is still there. True if names are doubted.
+/// more; and where all names were taken back for that, the mismatch is still there. If names are doubted, with the energy that may
+/// be another physics' ([`intervals::intervals`]).
 fn doubt(
     bench: &Workbench<'_>,
     selection: &mut Selection,
     verdict: Verdict,
-    (left, held): (Explainable, &(f64, f64, Vec<f64>)),
+    (left, held): (Explainable, &Held),
     (confirmed, taken_back): (bool, bool),
     unavoidable: f64,
 ) -> (Verdict, Option<f64>) {
@@ -780,66 +780,45 @@ fn doubt(
     let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
     let rest = energy(&selection.fit);
     let explained = (energy(&selection.plain) - rest).max(1e-300);
-    let allowed = allowed(bench, unavoidable);
-    // What is left beyond the stated noise, if that is stated well enough.
-    let count = bench.len().max(1) as f64;
-    let certain = rest > STATED * allowed
-        && rest - allowed
-            > (select::CERTAIN * allowed * (2.0 / count).sqrt()).max(swing(bench) * count);
-    let beyond = if bench.problem.noise > 0.0 && certain {
-        (rest - allowed) / explained
-    } else {
-        0.0
-    };
-    let reach = left.share * rest / explained;
     let wavers = intervals::variations(bench, &selection.fit)
         .into_iter()
         .filter(|variation| variation.deviations > select::CERTAIN)
         .fold(0.0f64, |most, variation| most.max(variation.share));
-    // Values that are found in a part of the recording have to do in the other part.
-    let (mut here, mut there) = (0.0, 0.0);
-    for (own, other) in selection.fit.residual.iter().zip(&held.2) {
-        if other.is_finite() {
-            here += own * own;
-            there += other * other;
-        }
-    }
-    let carried = (there - here).max(0.0) / explained;
+    let (missed, carried) = carried(&selection.fit, held);
+    // Each as a share of what the named effects change, in energy; and whether it is more than chance.
+    let signs = [
+        (
+            missed / explained,
+            carried,
+            "its values from one part of the recording miss the other by",
+        ),
+        (
+            wavers,
+            true,
+            "its values would have to differ from stretch to stretch by",
+        ),
+        (
+            left.share * rest / explained,
+            left.is_real(),
+            "what is left within reach of the inputs is",
+        ),
+        (
+            beyond(bench, rest, unavoidable) / explained,
+            true,
+            "what is left beyond the stated noise is",
+        ),
+    ];
     let members = &selection.fit.model.members;
     let general = members.iter().find(|member| member.effect.general());
-    let doubts = [
-        general.map(|member| {
-            format!(
-                "with so many values {} follows any process of its kind",
-                member.id()
-            )
-        }),
-        (carried > DOUBTED && there > STATED * here).then(|| {
-            format!(
-                "its values from one part of the recording miss the other by {} of its change",
-                percent(carried.sqrt())
-            )
-        }),
-        (wavers > DOUBTED).then(|| {
-            format!(
-                "its values would have to differ by {} from stretch to stretch",
-                percent(wavers.sqrt())
-            )
-        }),
-        (left.is_real() && reach > DOUBTED).then(|| {
-            format!(
-                "what is left within reach of the inputs is {} of its change",
-                percent(reach.sqrt())
-            )
-        }),
-        (beyond > DOUBTED).then(|| {
-            format!(
-                "what is left beyond the stated noise is {} of its change",
-                percent(beyond.sqrt())
-            )
-        }),
-    ];
-    let doubts: Vec<String> = doubts.into_iter().flatten().collect();
+    let mut doubts: Vec<String> = general
+        .map(|member| format!("{} follows any process of its kind", member.id()))
+        .into_iter()
+        .collect();
+    for (share, real, what) in signs {
+        if real && share > DOUBTED {
+            doubts.push(format!("{what} {} of its change", percent(share.sqrt())));
+        }
+    }
     if doubts.is_empty() {
         return (verdict, None);
     }
@@ -848,10 +827,33 @@ fn doubt(
         selection.fit.model.ids().join(", "),
         doubts.join(", and ")
     ));
-    let share = [carried, wavers, reach, beyond]
-        .into_iter()
-        .fold(0.0, f64::max);
-    (Verdict::Ambiguous, Some(share * explained))
+    let most = signs.iter().map(|(share, ..)| *share).fold(0.0, f64::max);
+    (Verdict::Ambiguous, Some(most * explained))
+}
+
+/// Energy by which values that were found in a part of the recording miss the other part, beyond what the fit leaves; and whether
+/// that is much beside it.
+fn carried(fit: &Fit, held: &Held) -> (f64, bool) {
+    let told = held.residual.iter().zip(&fit.residual);
+    let (there, here) = told
+        .filter(|(there, _)| there.is_finite())
+        .fold((0.0, 0.0), |(a, b), (there, here)| {
+            (a + there * there, b + here * here)
+        });
+    ((there - here).max(0.0), there > STATED * here)
+}
+
+/// Energy of what is left beyond the stated noise, if that is stated well enough to tell.
+fn beyond(bench: &Workbench<'_>, rest: f64, unavoidable: f64) -> f64 {
+    let allowed = allowed(bench, unavoidable);
+    let count = bench.len().max(1) as f64;
+    let chance = select::CERTAIN * allowed * (2.0 / count).sqrt();
+    let certain = rest > STATED * allowed && rest - allowed > chance.max(swing(bench) * count);
+    if bench.problem.noise > 0.0 && certain {
+        rest - allowed
+    } else {
+        0.0
+    }
 }
 
 /// Correlation of the sizes of two series.
@@ -869,8 +871,18 @@ fn correlation(a: &[f64], b: &[f64]) -> f64 {
     ab / (aa * bb).sqrt().max(1e-300)
 }
 
-/// Held-out blocks before and after, each fold predicted by a model fitted on the others; and the residuals.
-fn folds(bench: &Workbench<'_>, fit: &Fit) -> (f64, f64, Vec<f64>) {
+/// Held-out blocks, each fold predicted by a model fitted on the others.
+struct Held {
+    /// Error as designed, rms.
+    before: f64,
+    /// Error of the predictions, rms.
+    after: f64,
+    /// The same at each row; NaN where no block was held out.
+    residual: Vec<f64>,
+}
+
+/// Fits a model anew for each fold.
+fn folds(bench: &Workbench<'_>, fit: &Fit) -> Held {
     let plain = bench.residual(&bench.plain);
     let mut residual = vec![f64::NAN; bench.len()];
     let folds = FOLDS.min(bench.blocks.len());
@@ -891,8 +903,11 @@ fn folds(bench: &Workbench<'_>, fit: &Fit) -> (f64, f64, Vec<f64>) {
     let before = rms((0..bench.len())
         .filter(|&row| residual[row].is_finite())
         .map(|row| plain[row]));
-    let after = rms(residual.iter().copied());
-    (before, after, residual)
+    Held {
+        before,
+        after: rms(residual.iter().copied()),
+        residual,
+    }
 }
 
 /// Which effect accounts for each place: the one that changes the reading most there.

@@ -23,6 +23,7 @@ use crate::{
     failure::Failure,
     model::{Model, Sensor, registry},
     problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View},
+    report::format::count,
     simulate::board::{Board, Pace},
 };
 
@@ -349,7 +350,8 @@ impl Work<'_> {
             }
             if spoiled > 0 {
                 self.remark(format!(
-                    "{spoiled} readings of {measured} left out: a range change fell into their conversion, and the board itself marks them invalid"
+                    "{} of {measured} left out: a range change fell into the conversion, and the board itself marks that invalid",
+                    count(spoiled, "reading")
                 ));
             }
         }

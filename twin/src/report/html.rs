@@ -520,7 +520,7 @@ fn error_bars(page: &mut String, signal: &SignalReport) {
         ));
     }
     page.push_str(&format!(
-        "</div><p class=\"hint\">Held-out error of {}. The mark is the noise floor: no model can go below it.</p>\n",
+        "</div><p class=\"hint\">Held-out error of {}. The mark is the noise that is stated or counted: what lies at it has nothing left to explain.</p>\n",
         count(signal.samples, "sample")
     ));
 }
