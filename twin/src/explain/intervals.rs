@@ -509,6 +509,81 @@ mod tests {
         );
     }
 
+    /// Share of the intervals of an effect's first value with the truth in them, where noise goes through the effect, and then
+    /// through a converter's steps.
+    fn coverage_at_the_end(effect: &str, truth: &[f64], step_a: f64) -> f64 {
+        const RECORDINGS: u64 = 60;
+        let effect = find(effect).unwrap();
+        let mut covered = 0;
+        for seed in 0..RECORDINGS {
+            let mut problem = problem(seed, WHITE, true, step_a);
+            let mut random = ChaCha8Rng::seed_from_u64(RECORDINGS + seed);
+            for (value, reference) in problem
+                .observed
+                .value
+                .iter_mut()
+                .zip(&problem.drive.reference)
+            {
+                let noise: f64 = StandardNormal.sample(&mut random);
+                let read = reference + NOISE_A * noise;
+                *value = match effect.card().id {
+                    "dead-band" if read.abs() < truth[0] => 0.0,
+                    "clipping" => read.min(truth[0]).max(truth[1]),
+                    _ => read,
+                };
+                if step_a > 0.0 {
+                    *value = (*value / step_a).round() * step_a;
+                }
+            }
+            let bench = Workbench::new(&problem, &[]);
+            let model = Model {
+                members: vec![Member {
+                    effect,
+                    values: truth.iter().map(|value| value * 1.001).collect(),
+                }],
+                ..Model::default()
+            };
+            let fit = refit(&bench, &model, None);
+            let [low, high] = intervals(&bench, &fit, 0.0)[0][0];
+            covered += u64::from((low..=high).contains(&truth[0]));
+        }
+        covered as f64 / RECORDINGS as f64
+    }
+
+    #[test]
+    fn noise_that_crosses_a_threshold_both_ways_is_in_the_interval() {
+        let found = coverage_at_the_end("dead-band", &[31.7], 0.0);
+        assert!(found > 0.86, "{found}");
+    }
+
+    #[test]
+    fn a_rail_is_known_to_half_a_step_of_the_converter() {
+        let found = coverage_at_the_end("clipping", &[97.3, -2400.0], 1.2);
+        assert!(found > 0.86, "{found}");
+    }
+
+    #[test]
+    fn what_is_left_beside_an_effect_widens_its_interval() {
+        let problem = problem(1, WHITE, true, 0.0);
+        let bench = Workbench::new(&problem, &[]);
+        let model = Model {
+            members: vec![Member {
+                effect: find("offset").unwrap(),
+                values: vec![TRUTH[0].1],
+            }],
+            ..Model::default()
+        };
+        let fit = refit(&bench, &model, None);
+        let half = |beside: f64| {
+            let [low, high] = intervals(&bench, &fit, beside)[0][0];
+            0.5 * (high - low)
+        };
+        // A zero error of 10 A in each row has this energy: some of it may be the zero's own.
+        let wider = half(ROWS as f64 * 100.0);
+        assert!((wider / half(0.0).hypot(10.0) - 1.0).abs() < 0.2, "{wider}");
+        assert!(half(0.0) < 5.0, "{}", half(0.0));
+    }
+
     #[test]
     fn students_percentiles_are_those_of_the_tables() {
         for (freedom, table) in [(3.0, 3.182), (5.0, 2.571), (10.0, 2.228), (23.0, 2.069)] {

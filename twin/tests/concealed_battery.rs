@@ -1,7 +1,7 @@
-//! Charge transfer concealed in a real drive.
+//! Charge transfer and relaxation concealed in the voltage of a cell on a real drive.
 //!
-//! The current is real (recordings/panasonic-18650pf); the voltage is made here, from Butler–Volmer's equation as it stands, solved by
-//! bisection. Evidence of kind (d): our own simulator; it guards against regressions and proves nothing more.
+//! The current is real (recordings/panasonic-18650pf); the voltage is made here: charge transfer from Butler–Volmer's equation as it
+//! stands, solved by bisection, relaxation from branches, one by one. Evidence of kind (d): our own simulator; it guards against regressions and proves nothing more.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
@@ -57,19 +57,24 @@ fn overvoltage_v(i: f64, exchange_a: f64, kelvin: f64) -> f64 {
     0.5 * (low + high)
 }
 
+fn noise(seed: u64) -> impl FnMut() -> f64 {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    // Twelve evenly spread numbers have variance one.
+    move || {
+        let sum: f64 = (0..12)
+            .map(|_| f64::from(random.next_u32()) / f64::from(u32::MAX))
+            .sum();
+        NOISE_V * (sum - 6.0)
+    }
+}
+
 /// A cell with an exchange current at 25 °C (infinite: none of it), whose resistances follow temperature by `b_k`.
 fn explained(exchange_a: f64, b_k: f64, around_c: f64, seed: u64) -> Report {
     let current = current_a();
     let temperature: Vec<f64> = (0..ROWS)
         .map(|k| around_c + 6.0 * (k as f64 * STEP_S / 300.0).sin())
         .collect();
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let mut noise = || {
-        let sum: f64 = (0..12)
-            .map(|_| f64::from(random.next_u32()) / f64::from(u32::MAX))
-            .sum();
-        NOISE_V * (sum - 6.0)
-    };
+    let mut noise = noise(seed);
     let slope_ohm = GAS_OVER_FARADAY * 298.15 / exchange_a;
     let (mut charge_ah, mut before) = (0.0, current[0]);
     let value = current
@@ -91,12 +96,24 @@ fn explained(exchange_a: f64, b_k: f64, around_c: f64, seed: u64) -> Report {
             open_v - RESISTANCE_OHM * factor * i - transfer_v + noise()
         })
         .collect();
-    let t_s: Vec<f64> = (0..ROWS).map(|k| k as f64 * STEP_S).collect();
     let modelled = if b_k == 0.0 {
         Vec::new()
     } else {
         vec![("resistance-temperature", vec![b_k])]
     };
+    report(current, temperature, value, modelled, seed, &[])
+}
+
+/// What is said of a cell's voltage.
+fn report(
+    current: Vec<f64>,
+    temperature: Vec<f64>,
+    value: Vec<f64>,
+    modelled: Vec<(&'static str, Vec<f64>)>,
+    seed: u64,
+    without: &[&str],
+) -> Report {
+    let t_s: Vec<f64> = (0..ROWS).map(|k| k as f64 * STEP_S).collect();
     let problem = Problem {
         view: View::Voltage,
         name: "v_cell_v".into(),
@@ -133,7 +150,7 @@ fn explained(exchange_a: f64, b_k: f64, around_c: f64, seed: u64) -> Report {
     };
     let options = Options {
         seed,
-        without: Vec::new(),
+        without: without.iter().map(|id| (*id).to_owned()).collect(),
     };
     explain(&[problem], &[], &options, &mut |_, _| {})
 }
@@ -184,4 +201,58 @@ fn an_exchange_current_far_above_the_current_is_a_straight_resistance() {
         "{:?}",
         report.decisions
     );
+}
+
+/// A cell that relaxes through branches of so many ohms and seconds.
+fn relaxed(branches: &[(f64, f64)], seed: u64, without: &[&str]) -> Report {
+    let current = current_a();
+    let mut noise = noise(seed);
+    let mut through = vec![0.0; branches.len()];
+    let (mut charge_ah, mut before) = (0.0, current[0]);
+    let value = current
+        .iter()
+        .map(|&i| {
+            charge_ah += 0.5 * (i + before) * STEP_S / 3600.0;
+            let mut slow_v = 0.0;
+            for ((r_ohm, tau_s), flow) in branches.iter().zip(&mut through) {
+                // Exact on the straight line between two rows.
+                let kept = (-STEP_S / tau_s).exp();
+                let ramp = 1.0 - tau_s / STEP_S * (1.0 - kept);
+                *flow = kept * *flow + (1.0 - kept) * before + ramp * (i - before);
+                slow_v += r_ohm * *flow;
+            }
+            before = i;
+            open_circuit_v(0.9 - charge_ah / CAPACITY_AH) - RESISTANCE_OHM * i - slow_v + noise()
+        })
+        .collect();
+    report(current, vec![25.0; ROWS], value, Vec::new(), seed, without)
+}
+
+#[test]
+fn one_branch_is_named() {
+    let report = relaxed(&[(0.004, 40.0)], 9, &[]);
+    assert_eq!(report.verdict, Verdict::Explained, "{:?}", report.decisions);
+    assert_eq!(report.effects.len(), 1, "{:?}", report.decisions);
+    let effect = &report.effects[0];
+    assert_eq!(effect.id, "polarisation");
+    let [low, high] = effect.parameters[1].ci95;
+    assert!((low..=high).contains(&40.0), "{effect:?}");
+}
+
+#[test]
+fn branches_that_could_stand_for_any_relaxation_are_doubted() {
+    // Resistances and times as a diffusion would have them: it is taken out, and a ladder fits as well.
+    let branches = [
+        (0.0012, 160.0),
+        (0.0003, 40.0),
+        (0.00013, 18.0),
+        (0.00008, 10.0),
+    ];
+    let report = relaxed(&branches, 10, &["diffusion"]);
+    assert_eq!(report.effects.len(), 1, "{:?}", report.decisions);
+    assert_eq!(report.effects[0].id, "polarisation");
+    assert!(report.effects[0].parameters.len() > 2, "{report:?}");
+    assert_eq!(report.verdict, Verdict::Ambiguous, "{:?}", report.decisions);
+    let said = report.decisions.join("\n");
+    assert!(said.contains("follows any process of its kind"), "{said}");
 }
