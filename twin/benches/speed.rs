@@ -91,13 +91,7 @@ fn problem(rows: usize, view: View, effects: &[(&str, &[f64])]) -> Problem {
         view,
         name: if battery { "v_cell_v" } else { "i_meas_a" }.into(),
         unit: if battery { "V" } else { "A" }.into(),
-        observed: Observed {
-            t_s: drive.t_s.clone(),
-            value: vec![0.0; rows],
-            valid: vec![true; rows],
-            segment: vec![0; rows],
-            on_drive_rows: true,
-        },
+        observed: Observed::with_drive(drive.t_s.clone(), vec![0.0; rows]),
         base: if battery {
             Base::Battery(BatteryBase {
                 capacity_ah: 60.0,
@@ -231,13 +225,7 @@ fn explain_three_hours(bencher: Bencher<'_, '_>, concealed: usize) {
 fn simulate_board(bencher: Bencher<'_, '_>, name: &str) {
     // A current frame each 10 ms.
     let drive = drive(SIMULATED, 0.01);
-    let observed = Observed {
-        t_s: drive.t_s.clone(),
-        value: vec![f64::NAN; SIMULATED],
-        valid: vec![true; SIMULATED],
-        segment: vec![0; SIMULATED],
-        on_drive_rows: true,
-    };
+    let observed = Observed::with_drive(drive.t_s.clone(), vec![f64::NAN; SIMULATED]);
     let kind = if name.starts_with("dual") {
         FrontEndKind::DualRange
     } else {

@@ -60,6 +60,19 @@ pub struct Observed {
     pub on_drive_rows: bool,
 }
 
+impl Observed {
+    /// Readings on the rows of a drive of one segment, all of which count. `t_s` in s.
+    pub fn with_drive(t_s: Vec<f64>, value: Vec<f64>) -> Self {
+        Self {
+            valid: vec![true; value.len()],
+            segment: vec![0; value.len()],
+            on_drive_rows: true,
+            t_s,
+            value,
+        }
+    }
+}
+
 /// What the simulation as designed says, at each observed row, and what it needs to be run again with effects.
 #[derive(Clone, Debug)]
 pub enum Base {

@@ -6,10 +6,12 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+mod noise;
+
 use std::path::Path;
 
-use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
+use noise::noise;
+
 use twin::explain::{Options, explain};
 use twin::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
 use twin::report::data::{Report, Verdict};
@@ -68,21 +70,9 @@ fn truth() -> Truth {
     }
 }
 
-fn noise(seed: u64) -> impl FnMut() -> f64 {
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
-    // Twelve evenly spread numbers have variance one.
-    move || {
-        NOISE_A
-            * ((0..12)
-                .map(|_| f64::from(random.next_u32()) / f64::from(u32::MAX))
-                .sum::<f64>()
-                - 6.0)
-    }
-}
-
 /// Explains `reading` plus noise.
 fn explained(truth: &Truth, reading: Vec<f64>, seed: u64, without: &[&str]) -> Report {
-    let mut noise = noise(seed);
+    let mut noise = noise(seed, NOISE_A);
     let value: Vec<f64> = reading.iter().map(|y| y + noise()).collect();
     let rows = value.len();
     let problem = Problem {
@@ -98,13 +88,7 @@ fn explained(truth: &Truth, reading: Vec<f64>, seed: u64, without: &[&str]) -> R
             continues: vec![false],
             ..Drive::default()
         },
-        observed: Observed {
-            t_s: truth.t_s.clone(),
-            value,
-            valid: vec![true; rows],
-            segment: vec![0; rows],
-            on_drive_rows: true,
-        },
+        observed: Observed::with_drive(truth.t_s.clone(), value),
         base: Base::Sensor(SensorBase {
             full_scale: Some(600.0),
             range_ratio: 10.0,

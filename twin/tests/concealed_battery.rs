@@ -1,14 +1,17 @@
 //! Charge transfer and relaxation concealed in the voltage of a cell on a real drive.
 //!
 //! The current is real (recordings/panasonic-18650pf); the voltage is made here: charge transfer from Butler–Volmer's equation as it
-//! stands, solved by bisection, relaxation from branches, one by one. Evidence of kind (d): our own simulator; it guards against regressions and proves nothing more.
+//! stands, solved by bisection, relaxation from branches, one by one. Evidence of kind (d): our own simulator; it guards against
+//! regressions and proves nothing more.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+mod noise;
+
 use std::path::Path;
 
-use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
+use noise::noise;
+
 use twin::explain::{Options, explain};
 use twin::problem::{Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, View};
 use twin::report::data::{Report, Verdict};
@@ -57,24 +60,13 @@ fn overvoltage_v(i: f64, exchange_a: f64, kelvin: f64) -> f64 {
     0.5 * (low + high)
 }
 
-fn noise(seed: u64) -> impl FnMut() -> f64 {
-    let mut random = ChaCha8Rng::seed_from_u64(seed);
-    // Twelve evenly spread numbers have variance one.
-    move || {
-        let sum: f64 = (0..12)
-            .map(|_| f64::from(random.next_u32()) / f64::from(u32::MAX))
-            .sum();
-        NOISE_V * (sum - 6.0)
-    }
-}
-
 /// A cell with an exchange current at 25 °C (infinite: none of it), whose resistances follow temperature by `b_k`.
 fn explained(exchange_a: f64, b_k: f64, around_c: f64, seed: u64) -> Report {
     let current = current_a();
     let temperature: Vec<f64> = (0..ROWS)
         .map(|k| around_c + 6.0 * (k as f64 * STEP_S / 300.0).sin())
         .collect();
-    let mut noise = noise(seed);
+    let mut noise = noise(seed, NOISE_V);
     let slope_ohm = GAS_OVER_FARADAY * 298.15 / exchange_a;
     let (mut charge_ah, mut before) = (0.0, current[0]);
     let value = current
@@ -126,13 +118,7 @@ fn report(
             continues: vec![false],
             ..Drive::default()
         },
-        observed: Observed {
-            t_s,
-            value,
-            valid: vec![true; ROWS],
-            segment: vec![0; ROWS],
-            on_drive_rows: true,
-        },
+        observed: Observed::with_drive(t_s, value),
         base: Base::Battery(BatteryBase {
             capacity_ah: CAPACITY_AH,
             efficiency: 1.0,
@@ -206,7 +192,7 @@ fn an_exchange_current_far_above_the_current_is_a_straight_resistance() {
 /// A cell that relaxes through branches of so many ohms and seconds.
 fn relaxed(branches: &[(f64, f64)], seed: u64, without: &[&str]) -> Report {
     let current = current_a();
-    let mut noise = noise(seed);
+    let mut noise = noise(seed, NOISE_V);
     let mut through = vec![0.0; branches.len()];
     let (mut charge_ah, mut before) = (0.0, current[0]);
     let value = current

@@ -308,18 +308,16 @@ fn profile(
     let here = loss(&fit.residual, fit.sigma);
     let loudness = 2.0 * here / fit.residual.len().max(1) as f64;
     let limit = here + rise * loudness.max(0.1);
-    let beyond = |residual: &[f64]| {
-        let jumps = fit
-            .residual
-            .iter()
-            .zip(residual)
-            .map(|(best, there)| huber(there / fit.sigma) - huber(best / fit.sigma));
-        let jumped: f64 = jumps
-            .filter(|jump| jump.abs() > JUMP)
-            .map(|jump| jump * jump)
-            .sum();
-        let risen = loss(residual, fit.sigma);
-        risen > limit && risen > here + CHANCE * jumped.sqrt()
+    let excluded = |residual: &[f64]| {
+        let there = loss(residual, fit.sigma);
+        let jumped = || -> f64 {
+            let rows = fit.residual.iter().zip(residual);
+            rows.map(|(best, moved)| huber(moved / fit.sigma) - huber(best / fit.sigma))
+                .filter(|jump| jump.abs() > JUMP)
+                .map(|jump| jump * jump)
+                .sum()
+        };
+        there > limit && there > here + CHANCE * jumped().sqrt()
     };
     let risen = |there: f64| {
         let mut model = fit.model.clone();
@@ -327,7 +325,7 @@ fn profile(
         let others_free = model.members.iter().any(|m| m.values.len() > 1)
             || model.members.len() > 1
             || bench.aligns(&model);
-        let fixed = beyond(&bench.residual(&bench.run(&model)));
+        let fixed = excluded(&bench.residual(&bench.run(&model)));
         if !fixed || !others_free {
             return fixed;
         }
@@ -335,7 +333,7 @@ fn profile(
             held: Some((member, parameter)),
             ..model
         };
-        beyond(&refit(bench, &model, None).residual)
+        excluded(&refit(bench, &model, None).residual)
     };
     let size = match card.search {
         Search::Linear | Search::Smooth => (high - low).abs().min(1e6 * value.abs().max(1e-6)),
@@ -430,13 +428,7 @@ mod tests {
                 continues: vec![false],
                 ..Drive::default()
             },
-            observed: Observed {
-                t_s,
-                value,
-                valid: vec![true; ROWS],
-                segment: vec![0; ROWS],
-                on_drive_rows: true,
-            },
+            observed: Observed::with_drive(t_s, value),
             base: Base::Sensor(SensorBase {
                 full_scale: Some(600.0),
                 step: step_a,

@@ -1,0 +1,16 @@
+//! Noise of the tests' own recordings.
+
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
+
+/// White noise of a standard deviation, in its unit.
+pub fn noise(seed: u64, deviation: f64) -> impl FnMut() -> f64 {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    // Twelve evenly spread numbers have variance one.
+    move || {
+        let sum: f64 = (0..12)
+            .map(|_| f64::from(random.next_u32()) / f64::from(u32::MAX))
+            .sum();
+        deviation * (sum - 6.0)
+    }
+}
