@@ -301,8 +301,9 @@ def all_at_once(recording: Series) -> Fitted:
     """Least squares on the whole dictionary; an effect is named if an F-test says that its columns are needed.
 
     F-test of all columns of an effect together against the model without them, 1 % over the number of effects
-    (Bonferroni), independent errors. Columns that the others make up are left out. If what is left is singular to
-    eight digits, the prediction is by ridge regression, its weight by five-fold cross-validation over contiguous blocks.
+    (Bonferroni), independent errors; with fewer rows than columns no test, and no name. Columns that the others make up
+    are left out. If what is left is singular to eight digits, the prediction is by ridge regression, its weight by
+    five-fold cross-validation over contiguous blocks.
     """
     valid = recording.valid
     entries = dictionary(recording)
@@ -315,7 +316,7 @@ def all_at_once(recording: Series) -> Fitted:
     diagonal = np.abs(np.diag(triangle))
     kept = np.sort(order[: len(diagonal)][diagonal > 1e-9 * diagonal[0]])
     singular = len(kept) < columns.shape[1] or np.linalg.cond(columns[:, kept]) > 1e8
-    named = needed(columns[:, kept], target, owner[kept])
+    named = needed(columns[:, kept], target, owner[kept]) if len(kept) < len(target) else []
     weight = ridge_weight(columns, target) if singular else 0.0
     coefficients = ridge(columns, target, weight) / size
 

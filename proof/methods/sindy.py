@@ -68,10 +68,12 @@ def fit(recording: Series) -> Fitted:
     form is linear in its state: r[k] = a·r[k−1] + terms of the inputs; it is scored as a simulation from 0.
     """
     losses = []
+    # Polled readings that count once have no reading in the row before: no state can be fitted to them.
+    dynamics = (False, True) if follows(recording).sum() > 0.5 * recording.valid.sum() else (False,)
     for degree in DEGREES:
         terms = library(recording, degree)[1]
         for threshold in THRESHOLDS:
-            for dynamic in (False, True):
+            for dynamic in dynamics:
                 choice = Choice(degree, threshold, dynamic)
                 losses.append((cross_validated(recording, terms, choice), len(losses), choice))
     choice = min(losses)[2]

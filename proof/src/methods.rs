@@ -68,6 +68,8 @@ impl Methods {
         let folder = folders.case.join("methods");
         fs::create_dir_all(&folder)?;
         for (from, name) in [
+            // Polled readings that count once, if there are any.
+            (&folders.kept, "recording.csv"),
             (&folders.given, "recording.csv"),
             (&folders.given, "model.toml"),
             (&folders.given, "ocv.csv"),

@@ -13,6 +13,11 @@ use crate::{
     table::Table,
 };
 
+/// What is fitted.
+const RECORDING: &str = "recording.csv";
+/// What is not.
+const HOLDOUT: &str = "holdout.csv";
+
 /// One entry of expected.toml.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -38,6 +43,10 @@ pub struct Expected {
     /// Its reference.
     #[serde(default)]
     pub holdout_reference: Option<PathBuf>,
+    /// Column of a reading that is polled more often than it is measured: a value that comes again is no new reading, and
+    /// counts once.
+    #[serde(default)]
+    pub polled: Option<String>,
     /// Cuts the file in two.
     #[serde(default)]
     pub fit_until_s: Option<f64>,
@@ -121,7 +130,33 @@ impl Expected {
     }
 
     /// Writes recording.csv and model.toml (and reference.csv) to `given`, holdout.csv to `kept`.
+    ///
+    /// The tool gets every poll, as a user would give it. Repeats are empty in what is held out, and in the recording that
+    /// today's methods are given, which `kept` then has as well.
     pub fn prepare(&self, root: &Path, given: &Path, kept: &Path) -> Result<()> {
+        self.split(root, given, kept)?;
+        let Some(column) = &self.polled else {
+            return Ok(());
+        };
+        for (from, to) in [
+            (given.join(RECORDING), kept.join(RECORDING)),
+            (kept.join(HOLDOUT), kept.join(HOLDOUT)),
+        ] {
+            let mut table = Table::read(&from)?;
+            let values = table.column(column)?;
+            let once = (0..values.len())
+                .map(|row| match row.checked_sub(1) {
+                    Some(before) if values[before] == values[row] => f64::NAN,
+                    _ => values[row],
+                })
+                .collect();
+            table.replace(column, once);
+            table.write(&to)?;
+        }
+        Ok(())
+    }
+
+    fn split(&self, root: &Path, given: &Path, kept: &Path) -> Result<()> {
         if let Some(loops) = &self.loops {
             return self.prepare_loops(&root.join(loops), given, kept);
         }
@@ -139,17 +174,17 @@ impl Expected {
             let t_s = whole.column("t_s")?.to_vec();
             whole
                 .filtered(|row| t_s[row] < cut_s)
-                .write(&given.join("recording.csv"))?;
+                .write(&given.join(RECORDING))?;
             whole
                 .filtered(|row| t_s[row] >= cut_s)
-                .write(&kept.join("holdout.csv"))?;
+                .write(&kept.join(HOLDOUT))?;
             return Ok(());
         }
         let Some(holdout) = &self.holdout else {
             bail!("{}: holdout or fit_until_s is needed", self.id);
         };
-        copy(&fit, given.join("recording.csv"))?;
-        copy(&root.join(holdout), kept.join("holdout.csv"))?;
+        copy(&fit, given.join(RECORDING))?;
+        copy(&root.join(holdout), kept.join(HOLDOUT))?;
         if let Some(reference) = &self.fit_reference {
             copy(&root.join(reference), given.join("reference.csv"))?;
         }
@@ -206,8 +241,8 @@ impl Expected {
             );
             table
         };
-        part(&self.loops_fit).write(&given.join("recording.csv"))?;
-        part(&self.loops_holdout).write(&kept.join("holdout.csv"))?;
+        part(&self.loops_fit).write(&given.join(RECORDING))?;
+        part(&self.loops_holdout).write(&kept.join(HOLDOUT))?;
         fs::write(
             given.join("model.toml"),
             "schema = 1\nname = \"a core without hysteresis\"\n\n[sensor]\nfront_end = \"pair\"\n\
@@ -257,9 +292,19 @@ mod tests {
             fs::create_dir(&kept).unwrap();
             case.prepare(&root(), &given, &kept)
                 .unwrap_or_else(|error| panic!("{}: {error:#}", case.id));
-            let fitted = Table::read(&given.join("recording.csv")).unwrap();
-            let held = Table::read(&kept.join("holdout.csv")).unwrap();
+            let fitted = Table::read(&given.join(RECORDING)).unwrap();
+            let held = Table::read(&kept.join(HOLDOUT)).unwrap();
             assert!(fitted.len() > 200 && held.len() > 100, "{}", case.id);
+            if let Some(column) = &case.polled {
+                let all = fitted.column(column).unwrap();
+                let once = Table::read(&kept.join(RECORDING)).unwrap();
+                let once = once.column(column).unwrap();
+                let new = 1 + all.windows(2).filter(|pair| pair[0] != pair[1]).count();
+                let left: Vec<f64> = once.iter().copied().filter(|v| v.is_finite()).collect();
+                assert_eq!(left.len(), new, "{}", case.id);
+                assert!(left.windows(2).all(|pair| pair[0] != pair[1]));
+                assert!(all.iter().all(|value| value.is_finite()));
+            }
             assert_eq!(
                 case.truth != "none",
                 !case.required.is_empty(),

@@ -65,6 +65,11 @@ impl Table {
         self.columns.insert(name.to_owned(), values);
     }
 
+    /// Puts other values into a column that is there.
+    pub fn replace(&mut self, name: &str, values: Vec<f64>) {
+        self.columns.insert(name.to_owned(), values);
+    }
+
     /// The rows for which `keep` holds.
     pub fn filtered(&self, keep: impl Fn(usize) -> bool) -> Self {
         let rows: Vec<usize> = (0..self.len()).filter(|row| keep(*row)).collect();

@@ -204,6 +204,10 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                         plainer.model.members.last().map_or("", Member::id)
                     ));
                     now = polish(bench, &plainer);
+                    // What only made up for the other equation goes with it.
+                    if let Some(leaner) = backward(bench, &now, &step_p99, &mut decisions) {
+                        now = polish(bench, &leaner);
+                    }
                     others = swapped(bench, &now);
                     named = name(bench, &now, &others, &step_p99);
                 }
