@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 from case import rms
 from cell_case import (
-    OTHER_DRIVE, REFERENCE_C, SIGMA_V, STEP_S, Design, Made, drive_a, scaled, visible_v, write_case,
+    OTHER_DRIVE, REFERENCE_C, STEP_S, Design, Made, drive_a, scaled, visible_v, write_case,
 )
 from drives import RECORDINGS, coloured, stream
 
@@ -362,7 +362,7 @@ def make(case: dict, out: pathlib.Path) -> None:
     # Against what is recorded: an offset is in the current.
     together_v = made[0].quiet_v - without.quiet_v - (made[0].designed_v - without.designed_v)
     combined = {"combined_strength": rms(together_v) / visible_v(1.0)}
-    write_case(out, case, *made, stated.lines(SIGMA_V), truth(hidden) | combined)
+    write_case(out, case, *made, stated.lines(case["noise"]), truth(hidden) | combined)
 
 
 def recorded(case: dict, drive: Drive, cell: Design, stated: Design, hidden: dict[str, Values], index: int) -> Made:

@@ -120,14 +120,21 @@ class Design:
         drop = self.resistance_ohm * driven + sum(ohm * low_pass(driven, tau_s) for ohm, tau_s in branches)
         return self.open_circuit_v(self.soc(current_a)) - drop
 
-    def lines(self, noise_v: float) -> list[str]:
-        """The model file, without a sensor."""
+    def lines(self, noise: str) -> list[str]:
+        """The model file, without a sensor; `noise` is the case's kind."""
+        part_v = SIGMA_V / np.sqrt(1.0 + WHITE_BESIDE**2)
+        stated = [f"noise_v = {SIGMA_V:.6g}"]
+        if noise == "coloured":
+            stated = [
+                f"noise_v = {WHITE_BESIDE * part_v:.6g}", f"noise_coloured_v = {part_v:.6g}",
+                f"noise_coloured_tau_s = {COLOURED_TAU_S:g}",
+            ]
         table = ", ".join(f"[{soc:.6g}, {volts:.7g}]" for soc, volts in self.ocv)
         lines = [
             "schema = 1", f'name = "{self.name}"', "", "[battery]", f"capacity_ah = {self.capacity_ah:.8g}",
             f"ohmic_resistance_ohm = {self.resistance_ohm:.8g}", f"resistance_uncertainty = {self.resistance_uncertainty:g}",
             f"initial_soc = {self.initial_soc:.8g}",
-            f"initial_soc_uncertainty = {self.initial_soc_uncertainty:g}", f"noise_v = {noise_v:.6g}", f"ocv = [{table}]",
+            f"initial_soc_uncertainty = {self.initial_soc_uncertainty:g}", *stated, f"ocv = [{table}]",
         ]
         if self.arrhenius_k:
             lines += ["", "[effects.resistance-temperature]", f"b_k = {self.arrhenius_k:.6g}"]

@@ -28,7 +28,7 @@ from scipy.optimize import least_squares, nnls
 
 from case import rms
 from cell_case import (
-    OTHER_DRIVE, REFERENCE_C, SIGMA_V, STEP_S, ZERO_CELSIUS_K, Design, Made, diffusion_ladder, drive_a, low_pass, scaled,
+    OTHER_DRIVE, REFERENCE_C, STEP_S, ZERO_CELSIUS_K, Design, Made, diffusion_ladder, drive_a, low_pass, scaled,
     visible_v, write_case,
 )
 from drives import stream
@@ -360,7 +360,7 @@ def make(case: dict, out: pathlib.Path) -> None:
     for name in set(sizes) & set(PHYSICAL):
         real = with_physics(real, name, sizes[name])
     made = [one_drive(case, real, stated, sizes, drive) for drive in (case["drive"], OTHER_DRIVE[case["drive"]])]
-    write_case(out, case, *made, stated.lines(SIGMA_V), truth(case, real, design, sizes, relaxed))
+    write_case(out, case, *made, stated.lines(case["noise"]), truth(case, real, design, sizes, relaxed))
 
 
 def one_drive(case: dict, cell: Cell, stated: Design, sizes: dict[str, float], drive: str) -> Made:

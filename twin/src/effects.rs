@@ -276,6 +276,11 @@ pub trait Effect: Sync {
         false
     }
 
+    /// Whether it cuts or rounds what comes in, noise with it: what comes out is no longer a signal with the stated noise on it.
+    fn cuts(&self) -> bool {
+        false
+    }
+
     /// Whether a parameter is a level at which readings stay.
     fn level(&self, _parameter: usize) -> bool {
         false

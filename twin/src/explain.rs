@@ -11,6 +11,7 @@ pub mod locate;
 pub mod screen;
 pub mod select;
 pub mod shape;
+pub mod whiten;
 pub mod workbench;
 
 use std::path::{Path, PathBuf};
@@ -19,7 +20,7 @@ use std::time::Instant;
 use crate::effects::chain::{Chain, Nuisance};
 use crate::effects::scene::Scale;
 use crate::effects::{Effect, IDEALISED, Search, Stage, find, find_with};
-use crate::problem::{Base, Problem};
+use crate::problem::{Base, Coloured, Problem};
 use crate::report::data::{
     EffectReport, FittedModel, HoldoutReport, Location, ParameterReport, Report, SignalPlots,
     SignalReport, Unexplained, Verdict,
@@ -187,11 +188,10 @@ fn one(
     report: &mut Report,
     progress: &mut dyn FnMut(f64, &str),
 ) -> Part {
-    let bench = Workbench::new(problem, &options.without);
-    let mut selection = select::select(&bench, options.seed, progress);
-    progress(0.95, "looking at what is left");
-    let features = Features::new(&bench);
-    let before = features.explain(&selection.plain.residual, options.seed);
+    let read = Workbench::new(problem, &options.without);
+    // Noise with a memory is made white for all that is decided; what is shown is as it was read.
+    let white = read.whitened();
+    let mut bench = white.as_ref().unwrap_or(&read);
     let others: Vec<Unfitted<'_>> = holdouts
         .iter()
         .flat_map(|holdout| holdout.problems.iter().map(move |other| (holdout, other)))
@@ -201,49 +201,48 @@ fn one(
             bench: Workbench::new(other, &[]),
         })
         .collect();
-    veto(&bench, &mut selection, &others);
-    vague(&bench, &mut selection);
-    let taken_back = wavering(&bench, &mut selection, &others);
-    if taken_back {
-        vague(&bench, &mut selection);
+    let mut decided = decide((bench, &read), &others, options.seed, progress);
+    // Behind what cuts or rounds, noise is not what the model file states: there readings have to do as they are.
+    if bench.is_white() && (decided.names_nothing() || decided.names_a_cut()) {
+        let again = decide((&read, &read), &others, options.seed, progress);
+        if again.names_a_cut() || (decided.names_a_cut() && !again.names_nothing()) {
+            bench = &read;
+            decided = again;
+        }
     }
-    shape::withdraw(&bench, &mut selection, options.seed);
-    let left = features.explain(&selection.fit.residual, options.seed);
-    let confirmed = confirmed(&selection, &others);
-    let unavoidable = unavoidable(&bench, &selection.fit, options.seed);
-    let verdict = judge(
-        &bench,
-        &mut selection,
-        &features,
-        confirmed,
-        before,
-        left,
-        unavoidable,
-    );
-    let held = folds(&bench, &selection.fit);
-    let (verdict, beside) = doubt(
-        &bench,
-        &mut selection,
+    let Decided {
+        mut selection,
         verdict,
-        (left, &held),
-        (confirmed, taken_back),
-        unavoidable,
-    );
+        left,
+        held,
+        beside,
+    } = decided;
     let doubted = beside.is_some();
     let model = &selection.fit.model;
 
-    let plain_residual = bench.residual(&bench.plain);
+    if bench.is_white() {
+        selection.decisions.push(format!(
+            "The stated noise has a memory of {} s: decided on what each reading says beyond those before it. Gains are shares of that.",
+            short(problem.coloured.tau_s)
+        ));
+    }
+    let shown = if bench.is_white() {
+        Fit::of(&read, model.clone(), selection.fit.cost)
+    } else {
+        selection.fit.clone()
+    };
+    let plain_residual = read.residual(&read.plain);
     let noise = if problem.noise > 0.0 {
         problem.noise
     } else {
-        fit::spread(&jumps(&selection.fit.residual)) / std::f64::consts::SQRT_2
+        fit::spread(&jumps(&shown.residual)) / std::f64::consts::SQRT_2
     };
     report.signals.push(SignalReport {
         name: problem.name.clone(),
         unit: problem.unit.clone(),
         noise_floor: noise,
         rmse_before: rms(plain_residual.iter().copied()),
-        rmse_after: rms(selection.fit.residual.iter().copied()),
+        rmse_after: rms(shown.residual.iter().copied()),
         held_out_blocks_before: held.before,
         held_out_blocks_after: held.after,
         samples: bench.len(),
@@ -251,13 +250,13 @@ fn one(
     let mut locations = if verdict == Verdict::NoMismatch {
         Vec::new()
     } else {
-        locate::locate(&bench, &plain_residual, options.seed)
+        locate::locate(&read, &plain_residual, options.seed)
     };
-    attribute(&bench, &selection.fit, &mut locations);
+    attribute(&read, &shown, &mut locations);
     report.locations.extend(locations);
     report
         .effects
-        .extend(effects(&bench, &selection, beside.unwrap_or(0.0)));
+        .extend(effects(bench, &selection, beside.unwrap_or(0.0)));
     report
         .holdouts
         .extend(others.iter().map(|other| HoldoutReport {
@@ -267,25 +266,96 @@ fn one(
             rmse_after: other.rmse(model),
         }));
     if doubted || matches!(verdict, Verdict::Unknown | Verdict::PartlyExplained) {
-        let place = locate::locate(&bench, &selection.fit.residual, options.seed)
+        let place = locate::locate(&read, &shown.residual, options.seed)
             .into_iter()
             .next();
         report.unexplained.push(Unexplained {
             signal: problem.name.clone(),
-            rmse: rms(selection.fit.residual.iter().copied()),
+            rmse: rms(shown.residual.iter().copied()),
             explainable_share: left.share,
             location: place,
         });
     }
     report.models.push(fitted(problem, &selection.fit));
-    report
-        .plots
-        .push(plots(&bench, &selection.fit, &held.residual));
-    let sentence = sentence(&bench, &selection, (verdict, doubted), left, report);
+    report.plots.push(plots(&read, &shown, &held.read));
+    let sentence = sentence(bench, &selection, (verdict, doubted), left, report);
     Part {
         verdict,
         sentence,
         selection,
+    }
+}
+
+/// What was decided about one signal.
+struct Decided {
+    selection: Selection,
+    verdict: Verdict,
+    left: Explainable,
+    held: Held,
+    /// See [`doubt`].
+    beside: Option<f64>,
+}
+
+impl Decided {
+    fn names_nothing(&self) -> bool {
+        self.selection.named.is_empty()
+    }
+
+    /// Whether an effect is named that noise does not come through as it is.
+    fn names_a_cut(&self) -> bool {
+        let members = &self.selection.fit.model.members;
+        self.selection
+            .named
+            .iter()
+            .any(|named| members[named.index].effect.cuts())
+    }
+}
+
+/// Selects, and asks what the names are worth.
+fn decide(
+    (bench, read): (&Workbench<'_>, &Workbench<'_>),
+    others: &[Unfitted<'_>],
+    seed: u64,
+    progress: &mut dyn FnMut(f64, &str),
+) -> Decided {
+    let mut selection = select::select(bench, seed, progress);
+    progress(0.95, "looking at what is left");
+    let features = Features::new(bench);
+    let before = features.explain(&selection.plain.residual, seed);
+    veto(bench, &mut selection, others);
+    vague(bench, &mut selection);
+    let taken_back = wavering(bench, &mut selection, others);
+    if taken_back {
+        vague(bench, &mut selection);
+    }
+    shape::withdraw((bench, read), &mut selection, seed);
+    let left = features.explain(&selection.fit.residual, seed);
+    let confirmed = confirmed(&selection, others);
+    let unavoidable = unavoidable(bench, &selection.fit, seed);
+    let verdict = judge(
+        bench,
+        &mut selection,
+        &features,
+        confirmed,
+        before,
+        left,
+        unavoidable,
+    );
+    let held = folds(bench, &selection.fit);
+    let (verdict, beside) = doubt(
+        bench,
+        &mut selection,
+        verdict,
+        (left, &held),
+        (confirmed, taken_back),
+        unavoidable,
+    );
+    Decided {
+        selection,
+        verdict,
+        left,
+        held,
+        beside,
     }
 }
 
@@ -456,7 +526,8 @@ fn stand_in(
     holds: &dyn Fn(&Fit) -> bool,
 ) -> Option<Fit> {
     let named = selection.named.iter().find(|one| one.index == index)?;
-    let clues = bench.clues(&selection.fit.predicted);
+    let as_read = bench.as_read(&selection.fit.predicted);
+    let clues = bench.clues(&as_read);
     let mut fits: Vec<Fit> = named
         .equivalent
         .iter()
@@ -584,7 +655,8 @@ fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
         noise * noise * count
     } else {
         // A grid is told by the readings; reading and simulation are both on it.
-        let clues = bench.clues(&fit.predicted);
+        let as_read = bench.as_read(&fit.predicted);
+        let clues = bench.clues(&as_read);
         let grid: f64 = fit
             .model
             .members
@@ -611,7 +683,11 @@ fn judge(
     let known = noise.max(bench.problem.accuracy.zero);
     if selection.named.is_empty() {
         let residual = &selection.plain.residual;
-        let common = (quantile(residual, COMMON.0) / COMMON.1).min(rms(residual.iter().copied()));
+        let as_read = bench.as_read(residual);
+        let common = |residual: &[f64]| {
+            let common = quantile(residual, COMMON.0) / COMMON.1;
+            common.min(rms(residual.iter().copied()))
+        };
         // What the readings jump by from one to the next is the most that noise without a memory can be.
         let (floor, times, of) = if noise > 0.0 {
             (known, LOUD, "the noise that the model file states")
@@ -623,11 +699,18 @@ fn judge(
                 "what it changes from reading to reading",
             )
         };
-        let limit = (times * floor).hypot(swing(bench).sqrt());
-        return if floor > 0.0 && common > limit {
+        let loudest = [
+            (common(residual), swing(bench, bench.coloured())),
+            (common(&as_read), swing(bench, bench.problem.coloured)),
+        ]
+        .into_iter()
+        .filter(|(common, swing)| *common > (times * floor).hypot(swing.sqrt()))
+        .map(|(common, _)| common)
+        .fold(0.0, f64::max);
+        return if floor > 0.0 && loudest > 0.0 {
             selection.decisions.push(format!(
                 "No effect passes, yet all over the recording the mismatch is {} times {of}: unknown.",
-                short(common / floor)
+                short(loudest / floor)
             ));
             Verdict::Unknown
         } else if before.is_real() && before.share > STRUCTURE {
@@ -663,11 +746,12 @@ fn judge(
     };
     // What is beyond the noise that the design states is structure too, whatever the inputs say of it.
     let allowed = allowed(bench, unavoidable);
-    let beyond = if noise > 0.0 && rest > LOUD * LOUD * allowed + swing(bench) * count {
-        rest - allowed
-    } else {
-        0.0
-    };
+    let beyond =
+        if noise > 0.0 && rest > LOUD * LOUD * allowed + swing(bench, bench.coloured()) * count {
+            rest - allowed
+        } else {
+            0.0
+        };
     if smooth > 0.0 {
         selection.decisions.push(format!(
             "Structure is left: a smooth function of the recorded inputs would take {} of what remains (placebos up to {}), {} of what the named effects take.",
@@ -747,8 +831,7 @@ fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
 
 /// By how much the mean square of the stated noise that has a memory, in the view's unit squared, can be above the stated one by
 /// chance: over T it has no more than T/2τ independent values (its squares' covariance falls as the square of its own).
-fn swing(bench: &Workbench<'_>) -> f64 {
-    let coloured = bench.problem.coloured;
+fn swing(bench: &Workbench<'_>, coloured: Coloured) -> f64 {
     let span_s = match bench.t_s.as_slice() {
         [first, .., last] if last > first => last - first,
         _ => return 0.0,
@@ -848,7 +931,8 @@ fn beyond(bench: &Workbench<'_>, rest: f64, unavoidable: f64) -> f64 {
     let allowed = allowed(bench, unavoidable);
     let count = bench.len().max(1) as f64;
     let chance = select::CERTAIN * allowed * (2.0 / count).sqrt();
-    let certain = rest > STATED * allowed && rest - allowed > chance.max(swing(bench) * count);
+    let certain = rest > STATED * allowed
+        && rest - allowed > chance.max(swing(bench, bench.coloured()) * count);
     if bench.problem.noise > 0.0 && certain {
         rest - allowed
     } else {
@@ -877,14 +961,16 @@ struct Held {
     before: f64,
     /// Error of the predictions, rms.
     after: f64,
-    /// The same at each row; NaN where no block was held out.
+    /// The same at each row, as read; NaN where no block was held out.
+    read: Vec<f64>,
+    /// The same as it was fitted.
     residual: Vec<f64>,
 }
 
-/// Fits a model anew for each fold.
+/// Fits a model anew for each fold; as it is fitted, and as it was read.
 fn folds(bench: &Workbench<'_>, fit: &Fit) -> Held {
-    let plain = bench.residual(&bench.plain);
     let mut residual = vec![f64::NAN; bench.len()];
+    let mut seen = residual.clone();
     let folds = FOLDS.min(bench.blocks.len());
     for fold in 0..folds {
         let mut used = vec![0.0; bench.len()];
@@ -894,18 +980,21 @@ fn folds(bench: &Workbench<'_>, fit: &Fit) -> Held {
             }
         }
         let other = fit::fit(bench, &fit.model, Some(&used));
+        let as_read = bench.as_read(&other.residual);
         for (block, rows) in bench.blocks.iter().enumerate() {
             if block % folds == fold {
                 residual[rows.clone()].copy_from_slice(&other.residual[rows.clone()]);
+                seen[rows.clone()].copy_from_slice(&as_read[rows.clone()]);
             }
         }
     }
     let before = rms((0..bench.len())
-        .filter(|&row| residual[row].is_finite())
-        .map(|row| plain[row]));
+        .filter(|&row| seen[row].is_finite())
+        .map(|row| bench.y[row] - bench.plain[row]));
     Held {
         before,
-        after: rms(residual.iter().copied()),
+        after: rms(seen.iter().copied()),
+        read: seen,
         residual,
     }
 }

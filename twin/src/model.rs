@@ -133,8 +133,12 @@ pub struct Battery {
     pub cells: u32,
     /// Column of the current; `i_ref_a`, else `i_meas_a` if not stated.
     pub current: Option<String>,
-    /// Noise of a voltage reading, rms, in V, of one cell or the pack as recorded.
+    /// White noise of a voltage reading, rms, in V, of one cell or the pack as recorded.
     pub noise_v: f64,
+    /// Coloured noise of a voltage reading, rms, in V.
+    pub noise_coloured_v: f64,
+    /// Its time constant, in s.
+    pub noise_coloured_tau_s: f64,
     /// Accuracy of the voltmeter.
     pub accuracy_v: AccuracySpec,
     /// Noise of a reading of the state of charge, rms, in %.
@@ -165,6 +169,10 @@ struct BatteryText {
     current: Option<String>,
     #[serde(default)]
     noise_v: f64,
+    #[serde(default)]
+    noise_coloured_v: f64,
+    #[serde(default)]
+    noise_coloured_tau_s: f64,
     #[serde(default)]
     accuracy_v: AccuracySpec,
     #[serde(default)]
@@ -409,6 +417,8 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
             ("resistance_uncertainty", text.resistance_uncertainty),
             ("initial_soc_uncertainty", text.initial_soc_uncertainty),
             ("noise_v", text.noise_v),
+            ("noise_coloured_v", text.noise_coloured_v),
+            ("noise_coloured_tau_s", text.noise_coloured_tau_s),
             ("noise_pct", text.noise_pct),
         ],
     )?;
@@ -474,6 +484,8 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         cells: text.cells,
         current: text.current,
         noise_v: text.noise_v,
+        noise_coloured_v: text.noise_coloured_v,
+        noise_coloured_tau_s: text.noise_coloured_tau_s,
         accuracy_v: text.accuracy_v,
         noise_pct: text.noise_pct,
         accuracy_pct: text.accuracy_pct,

@@ -70,10 +70,21 @@ fn truth() -> Truth {
     }
 }
 
-/// Explains `reading` plus noise.
+/// Explains `reading` plus white noise.
 fn explained(truth: &Truth, reading: Vec<f64>, seed: u64, without: &[&str]) -> Report {
     let mut noise = noise(seed, NOISE_A);
     let value: Vec<f64> = reading.iter().map(|y| y + noise()).collect();
+    explained_as_read(truth, value, Coloured::default(), seed, without)
+}
+
+/// Explains readings that have noise of `NOISE_A` in all, some of it with a memory.
+fn explained_as_read(
+    truth: &Truth,
+    value: Vec<f64>,
+    coloured: Coloured,
+    seed: u64,
+    without: &[&str],
+) -> Report {
     let rows = value.len();
     let problem = Problem {
         view: View::Sensor,
@@ -96,7 +107,7 @@ fn explained(truth: &Truth, reading: Vec<f64>, seed: u64, without: &[&str]) -> R
         }),
         modelled: Vec::new(),
         noise: NOISE_A,
-        coloured: Coloured::default(),
+        coloured,
         accuracy: Accuracy::default(),
     };
     let options = Options {
@@ -357,6 +368,64 @@ fn a_closed_core_is_hysteresis() {
     let report = explained(&truth, reading, 30, &[]);
     let ids: Vec<&str> = report.effects.iter().map(|e| e.id.as_str()).collect();
     assert_eq!(ids, ["core-hysteresis"], "{:?}", report.decisions);
+}
+
+/// Noise that wanders for half a minute, a little white noise beside it.
+const SLOW: Coloured = Coloured {
+    rms: 0.48,
+    tau_s: 30.0,
+};
+
+/// Slow noise at each row, in A.
+fn slow_noise(seed: u64) -> Vec<f64> {
+    let mut step = noise(seed, 1.0);
+    let kept = (-STEP_S / SLOW.tau_s).exp();
+    let white = (NOISE_A.powi(2) - SLOW.rms.powi(2)).sqrt();
+    let mut slow = SLOW.rms * step();
+    (0..ROWS)
+        .map(|_| {
+            slow = kept * slow + SLOW.rms * (1.0 - kept * kept).sqrt() * step();
+            slow + white * step()
+        })
+        .collect()
+}
+
+fn plus(a: &[f64], b: &[f64]) -> Vec<f64> {
+    a.iter().zip(b).map(|(a, b)| a + b).collect()
+}
+
+#[test]
+fn slow_noise_hides_no_quick_effect_and_is_none() {
+    let truth = truth();
+    for seed in 0..4 {
+        let noise = slow_noise(seed);
+        let report = explained_as_read(&truth, plus(&truth.current_a, &noise), SLOW, seed, &[]);
+        assert_eq!(
+            report.verdict,
+            Verdict::NoMismatch,
+            "seed {seed}: {:?}",
+            report.effects
+        );
+        // 0.2 A rms beneath 0.5 A of noise.
+        let reading: Vec<f64> = truth.current_a.iter().map(|i| 1.004 * i).collect();
+        let report = explained_as_read(&truth, plus(&reading, &noise), SLOW, seed, &[]);
+        assert_named(&report, "gain", &[("gain", 1.004, 0.0003)]);
+        let signal = &report.signals[0];
+        // What is shown is as it was read: the noise is still there.
+        assert!(
+            (0.6..1.4).contains(&(signal.rmse_after / NOISE_A)),
+            "{signal:?}"
+        );
+    }
+}
+
+#[test]
+fn slow_noise_ahead_of_a_rail_stays_below_it() {
+    let truth = truth();
+    let value = plus(&truth.current_a, &slow_noise(3));
+    let value = value.iter().map(|y| y.min(140.0)).collect();
+    let report = explained_as_read(&truth, value, SLOW, 3, &[]);
+    assert_named(&report, "clipping", &[("high_a", 140.0, 0.5)]);
 }
 
 #[test]

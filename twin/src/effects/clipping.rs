@@ -65,6 +65,10 @@ impl Effect for Clipping {
         BENT
     }
 
+    fn cuts(&self) -> bool {
+        true
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (high, low) = (values[0], values[1]);
         scene

@@ -49,6 +49,10 @@ impl Effect for DeadBand {
         BENT
     }
 
+    fn cuts(&self) -> bool {
+        true
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let threshold = values[0];
         scene

@@ -46,6 +46,10 @@ impl Effect for Quantisation {
         })
     }
 
+    fn cuts(&self) -> bool {
+        true
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let step = values[0];
         if step > 0.0 {

@@ -48,7 +48,19 @@ pub struct Features {
 impl Features {
     /// Of a bench.
     pub fn new(bench: &Workbench<'_>) -> Self {
-        Self::with(bench, |rows| columns(bench, rows))
+        Self::with(bench, |rows| {
+            if !bench.is_white() {
+                return columns(bench, rows);
+            }
+            let all: Vec<usize> = (0..bench.len()).collect();
+            columns(bench, &all)
+                .into_iter()
+                .map(|column| {
+                    let column = bench.as_fitted(column);
+                    rows.iter().map(|&row| column[row]).collect()
+                })
+                .collect()
+        })
     }
 
     /// Of columns of one's own, each a value for every row of the bench.

@@ -121,13 +121,14 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
         }
         column
     };
+    let as_read = bench.as_read(&fit.predicted);
     let candidates: Vec<(&'static dyn Effect, Vec<f64>)> = bench
         .library
         .iter()
         .copied()
         .filter(|effect| may_join(&fit.model, *effect))
         .flat_map(|effect| {
-            let clues = bench.clues(&fit.predicted);
+            let clues = bench.clues(&as_read);
             effect
                 .starts(&bench.scale, &clues)
                 .into_iter()

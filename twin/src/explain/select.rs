@@ -255,14 +255,15 @@ fn marked(
     let mut now = now;
     for effect in bench.library.iter().copied() {
         let card = effect.card();
-        let Some(mark) = effect.mark(&bench.scale, &bench.clues(&now.predicted)) else {
+        let as_read = bench.as_read(&now.predicted);
+        let Some(mark) = effect.mark(&bench.scale, &bench.clues(&as_read)) else {
             continue;
         };
         let mut base = now.model.clone();
         base.members
             .retain(|member| member.id() != card.id && !card.looks_like.contains(&member.id()));
-        let energy =
-            now.residual.iter().map(|r| r * r).sum::<f64>() / now.residual.len().max(1) as f64;
+        let residual = bench.as_read(&now.residual);
+        let energy = dot(&residual, &residual) / residual.len().max(1) as f64;
         let gain = (mark.variance / energy.max(1e-300)).min(1.0);
         if gain < FLOOR {
             continue;
@@ -456,13 +457,18 @@ fn small(
     let card = member.effect.card();
     let without = bench.run(&after.model.without(index));
     let change = change(&after.predicted, &without);
-    let largest = change.iter().fold(0.0f64, |most, c| most.max(c.abs()));
-    let (mut from, mut to, mut changed, mut accuracy, mut rows) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    let as_read = bench.as_read(&change);
+    let largest = as_read.iter().fold(0.0f64, |most, c| most.max(c.abs()));
+    let (mut from, mut to, mut changed, mut size) = (0.0, 0.0, 0.0, 0.0);
+    let (mut accuracy, mut seen, mut rows) = (0.0, 0.0, 0.0);
+    let error = bench.as_read(&before.residual);
     for (row, change) in change.iter().enumerate() {
-        if change.abs() >= ACTS * largest && largest > 0.0 {
+        if as_read[row].abs() >= ACTS * largest && largest > 0.0 {
             from += before.residual[row].powi(2);
             to += after.residual[row].powi(2);
             changed += change.powi(2);
+            size += as_read[row].powi(2);
+            seen += error[row].powi(2);
             accuracy += bench.accuracy(row).powi(2);
             rows += 1.0;
         }
@@ -471,6 +477,15 @@ fn small(
         return Some("changes nothing".into());
     }
     let there = 1.0 - to / f64::max(from, 1e-300);
+    // What matters in practice is how large an effect is beside the error as it is read, however well quick noise shows it.
+    let (gain, there) = if bench.is_white() {
+        (
+            dot(&as_read, &as_read) / dot(&error, &error).max(1e-300),
+            size / seen.max(1e-300),
+        )
+    } else {
+        (gain, there)
+    };
     if gain < FLOOR && there < PLACE {
         return Some(format!(
             "real, but takes only {} of the held-out error ({} where it acts), below the practical floor of {}",
@@ -480,10 +495,10 @@ fn small(
         ));
     }
     let beside = beside(bench, after, index);
-    let mut all: f64 = change.iter().map(|c| c * c).sum();
+    let mut all = dot(&as_read, &as_read);
     if before.model.members.len() < after.model.members.len() {
         // What the others would do in its place is theirs.
-        all = all.min(apart(&before.predicted, &after.predicted));
+        all = all.min(apart(bench, &before.predicted, &after.predicted));
     }
     if all < beside {
         return Some(format!(
@@ -508,10 +523,10 @@ fn small(
     {
         return Some("smaller than the noise where it acts".into());
     }
-    if changed < accuracy {
+    if size < accuracy {
         return Some(format!(
             "its size, {:.3} rms, is within what reference and time stamps are accurate to, {:.3}",
-            f64::sqrt(changed / rows),
+            f64::sqrt(size / rows),
             f64::sqrt(accuracy / rows)
         ));
     }
@@ -563,8 +578,9 @@ pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
 }
 
 /// Energy by which two simulations are apart.
-fn apart(one: &[f64], other: &[f64]) -> f64 {
+fn apart(bench: &Workbench<'_>, one: &[f64], other: &[f64]) -> f64 {
     let change = change(one, other);
+    let change = bench.as_read(&change);
     dot(&change, &change)
 }
 
@@ -579,7 +595,7 @@ fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
                 return 0.0;
             }
             let without = bench.run(&fit.model.without(other));
-            share * share * apart(&fit.predicted, &without)
+            share * share * apart(bench, &fit.predicted, &without)
         })
         .sum();
     bench.modelled + others
@@ -728,20 +744,27 @@ fn backward(
             })
             .collect();
         let least = tried.into_iter().min_by(|a, b| a.2.total_cmp(&b.2));
-        match least {
-            Some((index, without, missed))
-                if missed <= p99_of(step_p99, here.model.members[index].id())
-                    || obstacle(bench, &without, here, index, missed).is_some() =>
-            {
-                decisions.push(format!(
-                    "{} taken out again: with the others there, it takes only {} of the held-out error.",
-                    here.model.members[index].id(),
-                    percent(missed)
-                ));
-                leaner = Some(without);
-            }
-            _ => return leaner,
-        }
+        let Some((index, without, missed)) = least else {
+            return leaner;
+        };
+        let id = here.model.members[index].id();
+        let placebos = p99_of(step_p99, id);
+        let why = if missed <= placebos {
+            Some(format!(
+                "takes only {} of the held-out error, placebos up to {}",
+                percent(missed),
+                percent(placebos)
+            ))
+        } else {
+            obstacle(bench, &without, here, index, missed)
+        };
+        let Some(why) = why else {
+            return leaner;
+        };
+        decisions.push(format!(
+            "{id} taken out again, with the others there: {why}."
+        ));
+        leaner = Some(without);
     }
 }
 
@@ -899,7 +922,7 @@ fn name(
                     let last = other.model.members.len() - 1;
                     share(bench, &without, other) >= least
                         // What the other effects' equations may be off by does not decide between two.
-                        && (apart(&now.predicted, &other.predicted) < beside || !beaten(bench, other, now))
+                        && (apart(bench, &now.predicted, &other.predicted) < beside || !beaten(bench, other, now))
                         // At the end of what is physics it cannot be named, and speaks against another's being certain.
                         && small(bench, &without, other, last, 1.0).is_none()
                 })

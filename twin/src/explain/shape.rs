@@ -77,17 +77,28 @@ fn held(columns: &[Vec<f64>], series: &[f64]) -> f64 {
 }
 
 /// Withdraws effects that are curves of the present current, where the recording's own curve is another.
-pub fn withdraw(bench: &Workbench<'_>, selection: &mut Selection, seed: u64) {
+///
+/// A curve is judged as it was read: by how much equations may be off is told of that.
+pub fn withdraw(
+    (bench, read): (&Workbench<'_>, &Workbench<'_>),
+    selection: &mut Selection,
+    seed: u64,
+) {
     if !matches!(bench.problem.base, Base::Sensor(_)) || bench.problem.view != View::Sensor {
         return;
     }
-    let hats = hats(bench);
+    let hats = hats(read);
     // A drive of few sizes has no curve to show.
     if hats.len() < LEAST_KNOTS {
         return;
     }
     while !selection.named.is_empty() {
-        let Some((index, why)) = misfit(bench, &selection.fit, &hats, seed) else {
+        let seen = if bench.is_white() {
+            Fit::of(read, selection.fit.model.clone(), selection.fit.cost)
+        } else {
+            selection.fit.clone()
+        };
+        let Some((index, why)) = misfit(read, &seen, &hats, seed) else {
             return;
         };
         let id = selection.fit.model.members[index].id();

@@ -1,5 +1,6 @@
 //! One problem, ready to be fitted: the rows that count, blocks of them, and what sizes are natural.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Mutex;
@@ -8,10 +9,11 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use rand_distr::{Distribution as _, StandardNormal};
 
+use super::whiten::Whitening;
 use crate::effects::chain::{Begun, Chain, Change, Nuisance, Variation};
 use crate::effects::scene::Scale;
 use crate::effects::{Clues, Effect, LIBRARY, Parameter, Stage, find_with};
-use crate::problem::{Base, Problem, View};
+use crate::problem::{Base, Coloured, Problem, View};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row).
 const MOST_ROWS: usize = 250_000;
@@ -83,7 +85,8 @@ impl Model {
     }
 }
 
-/// See the module.
+/// See the module. Where the noise is made white ([`Workbench::whitened`]), simulations and residuals are those of innovations, which
+/// is what fits and decisions are made of; [`Workbench::as_read`] leads back.
 #[allow(missing_debug_implementations, reason = "effects are functions")]
 pub struct Workbench<'a> {
     /// The problem.
@@ -97,7 +100,7 @@ pub struct Workbench<'a> {
     pub t_s: Vec<f64>,
     /// Their readings.
     pub y: Vec<f64>,
-    /// The simulation as designed, at those rows.
+    /// The simulation as designed, at those rows, as read.
     pub plain: Vec<f64>,
     /// The reference at those rows (for battery views the current).
     pub reference: Vec<f64>,
@@ -109,6 +112,8 @@ pub struct Workbench<'a> {
     pub modelled: f64,
     /// Fits that were made: from which model to which, with spread and loss.
     known: Mutex<HashMap<Key, (Model, f64, f64)>>,
+    /// Makes the stated noise white, with the readings after it.
+    white: Option<(Whitening, Vec<f64>)>,
 }
 
 /// A model to the last digit.
@@ -201,6 +206,64 @@ impl<'a> Workbench<'a> {
             blocks,
             library,
             known: Mutex::default(),
+            white: None,
+        }
+    }
+
+    /// The same with the stated noise made white, if it has a memory.
+    pub fn whitened(&self) -> Option<Self> {
+        let problem = self.problem;
+        let whitening = Whitening::new(&self.t_s, problem.noise, problem.coloured)?;
+        let mut y = self.y.clone();
+        whitening.apply(&mut y);
+        Some(Self {
+            problem,
+            chain: Chain::new(problem),
+            scale: self.scale.clone(),
+            rows: self.rows.clone(),
+            t_s: self.t_s.clone(),
+            y: self.y.clone(),
+            plain: self.plain.clone(),
+            reference: self.reference.clone(),
+            blocks: self.blocks.clone(),
+            library: self.library.clone(),
+            modelled: self.modelled,
+            known: Mutex::default(),
+            white: Some((whitening, y)),
+        })
+    }
+
+    /// Whether the noise was made white.
+    pub fn is_white(&self) -> bool {
+        self.white.is_some()
+    }
+
+    /// What of the stated noise has a memory here.
+    pub fn coloured(&self) -> Coloured {
+        if self.white.is_some() {
+            Coloured::default()
+        } else {
+            self.problem.coloured
+        }
+    }
+
+    /// A series of readings as fits see it.
+    pub fn as_fitted(&self, mut series: Vec<f64>) -> Vec<f64> {
+        if let Some((whitening, _)) = &self.white {
+            whitening.apply(&mut series);
+        }
+        series
+    }
+
+    /// A simulation or a residual in the view's unit, row by row.
+    pub fn as_read<'s>(&self, series: &'s [f64]) -> Cow<'s, [f64]> {
+        match &self.white {
+            None => Cow::Borrowed(series),
+            Some((whitening, _)) => {
+                let mut series = series.to_vec();
+                whitening.undo(&mut series);
+                Cow::Owned(series)
+            }
         }
     }
 
@@ -263,10 +326,10 @@ impl<'a> Workbench<'a> {
         let noisy = self
             .chain
             .run_with_noise(&members(model), model.nuisance, &noise);
-        self.rows
+        self.thinned(noisy)
             .iter()
             .zip(predicted)
-            .map(|(&row, predicted)| (noisy[row] - predicted).powi(2))
+            .map(|(noisy, predicted)| (noisy - predicted).powi(2))
             .filter(|change| change.is_finite())
             .sum()
     }
@@ -274,7 +337,7 @@ impl<'a> Workbench<'a> {
     /// Variance of a weighted sum of readings from a row on, `aᵀΣa`, under the noise that the model file states, with Σ of an
     /// exponential memory and white noise; `None` if it states none with a memory.
     pub fn carried(&self, from: usize, weights: &[f64]) -> Option<f64> {
-        let coloured = self.problem.coloured;
+        let coloured = self.coloured();
         if !(coloured.rms > 0.0 && coloured.tau_s > 0.0) {
             return None;
         }
@@ -328,23 +391,33 @@ impl<'a> Workbench<'a> {
     }
 
     fn thinned(&self, all: Vec<f64>) -> Vec<f64> {
-        if self.rows.len() == all.len() {
-            return all;
+        let mut here = if self.rows.len() == all.len() {
+            all
+        } else {
+            self.rows.iter().map(|&row| all[row]).collect()
+        };
+        if self.is_white() {
+            // Beyond the drive's ends nothing is known: the reading stands there, and says nothing.
+            for (value, y) in here.iter_mut().zip(&self.y) {
+                if !value.is_finite() {
+                    *value = *y;
+                }
+            }
         }
-        self.rows.iter().map(|&row| all[row]).collect()
+        self.as_fitted(here)
     }
 
     /// Reading less simulation.
     pub fn residual(&self, predicted: &[f64]) -> Vec<f64> {
-        self.y
-            .iter()
+        let y = self.white.as_ref().map_or(&self.y, |(_, y)| y);
+        y.iter()
             .zip(predicted)
             // Beyond the drive's ends (a delay can reach there) nothing is known.
             .map(|(y, p)| if p.is_finite() { y - p } else { 0.0 })
             .collect()
     }
 
-    /// What starts may look at.
+    /// What starts may look at; `predicted` as read.
     pub fn clues<'b>(&'b self, predicted: &'b [f64]) -> Clues<'b> {
         Clues {
             t_s: &self.t_s,

@@ -107,9 +107,16 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             battery,
             name,
         );
-        let (noise, accuracy) = match view {
-            View::StateOfCharge => (battery.noise_pct, battery.accuracy_pct),
-            _ => (battery.noise_v, battery.accuracy_v),
+        let (noise, coloured, accuracy) = match view {
+            View::StateOfCharge => (battery.noise_pct, Coloured::default(), battery.accuracy_pct),
+            _ => {
+                let coloured = Coloured {
+                    rms: battery.noise_coloured_v,
+                    tau_s: battery.noise_coloured_tau_s,
+                };
+                let noise = battery.noise_v.hypot(coloured.rms);
+                (noise, coloured, battery.accuracy_v)
+            }
         };
         items.push(Item {
             problem: Problem {
@@ -121,7 +128,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
                 base: Base::Battery(base),
                 modelled: Vec::new(),
                 noise,
-                coloured: Coloured::default(),
+                coloured,
                 accuracy: Accuracy {
                     zero: accuracy.zero,
                     gain: accuracy.gain,
