@@ -63,6 +63,8 @@ impl Effect for Quantisation {
 
 /// Readings that are looked at.
 const ENOUGH: usize = 4000;
+/// A gap is this share off the step at most.
+const OFF: f64 = 0.2;
 /// Sums that are kept side by side.
 const LANES: usize = 8;
 
@@ -95,7 +97,10 @@ fn lattice(observed: &[f64]) -> Vec<f64> {
     // The gap is known to rounding only: over the span the grid has to stay in step.
     let fine = 0.1 * least / span.max(least);
     let best = (-200..=200)
-        .map(|k| least * (1.0 + f64::from(k) * fine))
+        .map(|k| f64::from(k) * fine)
+        // Half of a step is a grid of the same readings: a coarse one must not be led there.
+        .filter(|share| share.abs() < OFF)
+        .map(|share| least * (1.0 + share))
         .max_by(|a, b| concentration(*a).total_cmp(&concentration(*b)));
     best.filter(|step| concentration(*step) > 0.95)
         .into_iter()
@@ -154,4 +159,25 @@ fn staircase(residuals: &[f64], simulated: &[f64], step: f64) -> (f64, f64) {
     }
     add(left, right);
     (along.iter().sum(), size.iter().sum())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_grid_of_few_levels_is_not_taken_for_one_of_half_steps() {
+        for (step, levels) in [(5.396_040_7, 13), (15.7, 5), (0.05, 900)] {
+            // As a recording has it: seven digits.
+            let readings: Vec<f64> = (0..20 * levels)
+                .map(|row| step * f64::from(row % (2 * levels) - levels))
+                .map(|value| (value * 1e5).round() * 1e-5)
+                .collect();
+            let found = lattice(&readings);
+            assert!(
+                found.len() == 1 && (found[0] / step - 1.0).abs() < 1e-4,
+                "{found:?} for {step}"
+            );
+        }
+    }
 }
