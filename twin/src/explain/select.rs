@@ -460,15 +460,13 @@ fn small(
     let as_read = bench.as_read(&change);
     let largest = as_read.iter().fold(0.0f64, |most, c| most.max(c.abs()));
     let (mut from, mut to, mut changed, mut size) = (0.0, 0.0, 0.0, 0.0);
-    let (mut accuracy, mut seen, mut rows) = (0.0, 0.0, 0.0);
-    let error = bench.as_read(&before.residual);
+    let (mut accuracy, mut rows) = (0.0, 0.0);
     for (row, change) in change.iter().enumerate() {
         if as_read[row].abs() >= ACTS * largest && largest > 0.0 {
             from += before.residual[row].powi(2);
             to += after.residual[row].powi(2);
             changed += change.powi(2);
             size += as_read[row].powi(2);
-            seen += error[row].powi(2);
             accuracy += bench.accuracy(row).powi(2);
             rows += 1.0;
         }
@@ -477,12 +475,8 @@ fn small(
         return Some("changes nothing".into());
     }
     let there = 1.0 - to / f64::max(from, 1e-300);
-    // What matters in practice is how large an effect is beside the error as it is read, however well quick noise shows it.
-    let (gain, there) = if bench.is_white() {
-        (
-            dot(&as_read, &as_read) / dot(&error, &error).max(1e-300),
-            size / seen.max(1e-300),
-        )
+    let (gain, there) = if bench.is_white() || cut(&after.model, index) {
+        size_beside(bench, &before.residual, &after.model, index)
     } else {
         (gain, there)
     };
@@ -531,6 +525,33 @@ fn small(
         ));
     }
     None
+}
+
+/// Whether another effect cuts or rounds what one gives.
+fn cut(model: &Model, index: usize) -> bool {
+    let mut others = model.members.iter().enumerate();
+    others.any(|(other, member)| other != index && member.effect.cuts())
+}
+
+/// How large an effect is beside the error as it is read, in energy: overall, and where it acts. What matters in practice is that,
+/// however well quick noise shows it, and however far a threshold behind it makes readings jump.
+fn size_beside(bench: &Workbench<'_>, residual: &[f64], model: &Model, index: usize) -> (f64, f64) {
+    let mut ahead = model.clone();
+    let member = ahead.members.remove(index);
+    ahead.members.retain(|member| !member.effect.cuts());
+    let without = bench.run(&ahead);
+    let change = change(&bench.run(&ahead.with(member)), &without);
+    let (change, error) = (bench.as_read(&change), bench.as_read(residual));
+    let largest = change.iter().fold(0.0f64, |most, c| most.max(c.abs()));
+    let acts = change.iter().zip(error.iter());
+    let (size, seen) = acts
+        .filter(|(change, _)| change.abs() >= ACTS * largest)
+        .fold((0.0, 0.0), |(size, seen), (change, error)| {
+            (size + change * change, seen + error * error)
+        });
+    let share = |size: f64, of: f64| size / of.max(1e-300);
+    let all = share(dot(&change, &change), dot(&error, &error));
+    (all, share(size, seen))
 }
 
 /// What of an effect's values would be at the end of what is physics.
