@@ -745,13 +745,29 @@ fn judge(
         0.0
     };
     // What is beyond the noise that the design states is structure too, whatever the inputs say of it.
-    let allowed = allowed(bench, unavoidable);
-    let beyond =
-        if noise > 0.0 && rest > LOUD * LOUD * allowed + swing(bench, bench.coloured()) * count {
+    let louder = |rest: f64, unavoidable: f64, coloured: Coloured| {
+        let allowed = allowed(bench, unavoidable);
+        let limit = LOUD * LOUD * allowed + swing(bench, coloured) * count;
+        if noise > 0.0 && rest > limit {
             rest - allowed
         } else {
             0.0
+        }
+    };
+    let beyond = louder(rest, unavoidable, bench.coloured());
+    // A drift that is slower than the stated noise hides in it once that was made white: not as it was read.
+    let (drift, times) = if bench.is_white() {
+        let energy = |residual: &[f64]| {
+            let as_read = bench.as_read(residual);
+            as_read.iter().map(|r| r * r).sum::<f64>()
         };
+        let rest = energy(&selection.fit.residual);
+        let explained = (energy(&selection.plain.residual) - rest).max(1e-300);
+        let drift = louder(rest, quiet, bench.problem.coloured);
+        (drift / explained, (rest / quiet).sqrt())
+    } else {
+        (0.0, 0.0)
+    };
     if smooth > 0.0 {
         selection.decisions.push(format!(
             "Structure is left: a smooth function of the recorded inputs would take {} of what remains (placebos up to {}), {} of what the named effects take.",
@@ -760,15 +776,21 @@ fn judge(
             percent(smooth / explained.max(1e-300))
         ));
     }
-    if beyond > 0.0 {
+    if beyond > 0.0 || drift > 0.0 {
+        let times = if beyond > 0.0 {
+            (rest / unavoidable).sqrt()
+        } else {
+            times
+        };
         selection.decisions.push(format!(
             "What remains is {} times the noise that the model file states.",
-            short((rest / unavoidable).sqrt())
+            short(times)
         ));
     }
-    if smooth > 0.0 || beyond > 0.0 {
+    if smooth > 0.0 || beyond > 0.0 || drift > 0.0 {
         // What the model file's own equations may be off by is no sign of another physics.
         let ratio = (smooth.max(beyond) - bench.modelled).max(0.0) / explained.max(1e-300);
+        let ratio = ratio.max(drift);
         let change = fit::change(&selection.fit.predicted, &selection.plain.predicted);
         let (shape, change) = features.shape(&selection.fit.residual, &change);
         let alike = if smooth > 0.0 {

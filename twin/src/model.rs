@@ -323,6 +323,21 @@ fn positive(places: &Places<'_>, table: &str, values: &[(&str, f64)]) -> Result<
     Ok(())
 }
 
+/// Coloured noise is so by its time constant.
+fn check_coloured(
+    places: &Places<'_>,
+    [table, key]: [&str; 2],
+    noise: f64,
+    tau_s: f64,
+) -> Result<(), Failure> {
+    if noise > 0.0 && tau_s <= 0.0 {
+        let expected =
+            "noise_coloured_tau_s beside it, a time above 0 s; without a memory it is white noise";
+        return Err(places.fault(&[table, key], &noise.to_string(), expected));
+    }
+    Ok(())
+}
+
 fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
     positive(
         places,
@@ -339,6 +354,12 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
             ("full_scale", sensor.full_scale.unwrap_or(1.0)),
             ("range_limit", sensor.range_limit.unwrap_or(1.0)),
         ],
+    )?;
+    check_coloured(
+        places,
+        ["sensor", "noise_coloured"],
+        sensor.noise_coloured,
+        sensor.noise_coloured_tau_s,
     )?;
     for (key, value) in [
         ("zero", sensor.accuracy.zero),
@@ -421,6 +442,12 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
             ("noise_coloured_tau_s", text.noise_coloured_tau_s),
             ("noise_pct", text.noise_pct),
         ],
+    )?;
+    check_coloured(
+        places,
+        ["battery", "noise_coloured_v"],
+        text.noise_coloured_v,
+        text.noise_coloured_tau_s,
     )?;
     let range = |key: &str, value: f64, good: bool, expected: &str| {
         if good {

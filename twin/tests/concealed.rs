@@ -420,6 +420,30 @@ fn slow_noise_hides_no_quick_effect_and_is_none() {
 }
 
 #[test]
+fn a_drift_that_is_slower_than_the_stated_noise_is_no_noise() {
+    let truth = truth();
+    let drift = |t: &f64| 6.0 * (t / 290.0).sin();
+    let noise = plus(
+        &slow_noise(5),
+        &truth.t_s.iter().map(drift).collect::<Vec<_>>(),
+    );
+    let report = explained_as_read(&truth, plus(&truth.current_a, &noise), SLOW, 5, &[]);
+    assert_ne!(
+        report.verdict,
+        Verdict::NoMismatch,
+        "{:?}",
+        report.decisions
+    );
+    let reading: Vec<f64> = truth.current_a.iter().map(|i| 1.01 * i).collect();
+    let report = explained_as_read(&truth, plus(&reading, &noise), SLOW, 5, &[]);
+    assert!(
+        !matches!(report.verdict, Verdict::NoMismatch | Verdict::Explained),
+        "{:?}",
+        report.decisions
+    );
+}
+
+#[test]
 fn slow_noise_ahead_of_a_rail_stays_below_it() {
     let truth = truth();
     let value = plus(&truth.current_a, &slow_noise(3));

@@ -86,7 +86,7 @@ fn the_models_of_this_project_are_read() {
 
 #[test]
 fn faults_name_line_key_and_what_was_expected() {
-    let cases: [(&str, &[&str]); 16] = [
+    let cases: [(&str, &[&str]); 18] = [
         (
             "schema = 1\n[sensor]\nstepp = 1\n",
             &["line 3", "stepp", "`step`", "`noise_coloured`"],
@@ -103,6 +103,19 @@ fn faults_name_line_key_and_what_was_expected() {
         (
             "schema = 1\n[sensor]\nnoise = -1\n",
             &["line 3", "sensor.noise", "-1", "zero or more"],
+        ),
+        (
+            "schema = 1\n[sensor]\nnoise = 0.1\nnoise_coloured = 0.5\n",
+            &[
+                "line 4",
+                "sensor.noise_coloured",
+                "0.5",
+                "noise_coloured_tau_s",
+            ],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\nnoise_coloured_v = 0.001\n",
+            &["line 4", "battery.noise_coloured_v", "noise_coloured_tau_s"],
         ),
         (
             "schema = 1\n[sensor]\nfront_end = \"hall\"\n",

@@ -91,6 +91,19 @@ fn the_rtx_3090_averages_over_a_second() {
     );
 }
 
+/// The same without the second file, at the polled instants: a rail at idle and one at full load would make up for readings whose
+/// age wanders by a tenth of a second.
+#[test]
+fn the_rtx_3090_is_not_said_to_clip() {
+    let recording = format!("{CARDS}/rtx3090-5050.csv");
+    let report = explain(&["--model", SENSOR, "--recording", &recording]);
+    let window_s = parameter(&report, "moving-average", "window_s");
+    assert!((0.9..=1.2).contains(&window_s), "{window_s} s");
+    assert!(names(&report, "gain"));
+    let named = effects(&report);
+    assert_eq!(named.len(), 2, "{named:?}");
+}
+
 /// The A100's sensor reads low by a few per cent; its step is too short against the sensor's 104 ms for more than a class of
 /// effects in time.
 #[test]
