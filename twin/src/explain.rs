@@ -763,8 +763,8 @@ fn judge(
         };
         let rest = energy(&selection.fit.residual);
         let explained = (energy(&selection.plain.residual) - rest).max(1e-300);
-        let drift = louder(rest, quiet, bench.problem.coloured);
-        (drift / explained, (rest / quiet).sqrt())
+        let drift = louder(rest, unavoidable, bench.problem.coloured);
+        (drift / explained, (rest / unavoidable).sqrt())
     } else {
         (0.0, 0.0)
     };
