@@ -219,7 +219,7 @@ impl<'a> Workbench<'a> {
         Some(Self {
             problem,
             chain: Chain::new(problem),
-            scale: self.scale.clone(),
+            scale: self.scale,
             rows: self.rows.clone(),
             t_s: self.t_s.clone(),
             y: self.y.clone(),
