@@ -226,11 +226,7 @@ fn one(
             short(problem.coloured.tau_s)
         ));
     }
-    let shown = if bench.is_white() {
-        Fit::of(&read, model.clone(), selection.fit.cost)
-    } else {
-        selection.fit.clone()
-    };
+    let shown = selection.fit.as_read(bench, &read);
     let plain_residual = read.residual(&read.plain);
     let noise = if problem.noise > 0.0 {
         problem.noise
@@ -756,17 +752,17 @@ fn judge(
     };
     let beyond = louder(rest, unavoidable, bench.coloured());
     // A drift that is slower than the stated noise hides in it once that was made white: not as it was read.
-    let (drift, times) = if bench.is_white() {
-        let energy = |residual: &[f64]| {
-            let as_read = bench.as_read(residual);
-            as_read.iter().map(|r| r * r).sum::<f64>()
-        };
-        let rest = energy(&selection.fit.residual);
-        let explained = (energy(&selection.plain.residual) - rest).max(1e-300);
-        let drift = louder(rest, unavoidable, bench.problem.coloured);
-        (drift / explained, (rest / unavoidable).sqrt())
+    let seen = |fit: &Fit| {
+        let as_read = bench.as_read(&fit.residual);
+        fit::dot(&as_read, &as_read)
+    };
+    let rest_read = seen(&selection.fit);
+    // As a share of what the named effects take.
+    let drift = if bench.is_white() {
+        let taken = (seen(&selection.plain) - rest_read).max(1e-300);
+        louder(rest_read, unavoidable, bench.problem.coloured) / taken
     } else {
-        (0.0, 0.0)
+        0.0
     };
     if smooth > 0.0 {
         selection.decisions.push(format!(
@@ -777,14 +773,10 @@ fn judge(
         ));
     }
     if beyond > 0.0 || drift > 0.0 {
-        let times = if beyond > 0.0 {
-            (rest / unavoidable).sqrt()
-        } else {
-            times
-        };
+        let loud = if beyond > 0.0 { rest } else { rest_read };
         selection.decisions.push(format!(
             "What remains is {} times the noise that the model file states.",
-            short(times)
+            short((loud / unavoidable).sqrt())
         ));
     }
     if smooth > 0.0 || beyond > 0.0 || drift > 0.0 {

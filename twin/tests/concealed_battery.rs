@@ -6,13 +6,12 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
-mod noise;
+mod common;
 
 use std::path::Path;
 
-use noise::noise;
+use common::{noise, said};
 
-use twin::explain::{Options, explain};
 use twin::problem::{Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, View};
 use twin::report::data::{Report, Verdict};
 
@@ -134,11 +133,7 @@ fn report(
         coloured: Coloured::default(),
         accuracy: Accuracy::default(),
     };
-    let options = Options {
-        seed,
-        without: without.iter().map(|id| (*id).to_owned()).collect(),
-    };
-    explain(&[problem], &[], &options, &mut |_, _| {})
+    said(problem, seed, without)
 }
 
 #[track_caller]

@@ -72,6 +72,15 @@ impl Fit {
         }
     }
 
+    /// The same on the bench of readings as they were read, if it was made on one of white noise.
+    pub fn as_read(&self, bench: &Workbench<'_>, read: &Workbench<'_>) -> Self {
+        if bench.is_white() {
+            Self::of(read, self.model.clone(), self.cost)
+        } else {
+            self.clone()
+        }
+    }
+
     /// The slope at its model: found once.
     pub fn slope(&self, bench: &Workbench<'_>) -> Arc<Slope> {
         let new = || Arc::new(slope(bench, &self.model, &self.predicted));

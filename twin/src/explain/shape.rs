@@ -93,11 +93,7 @@ pub fn withdraw(
         return;
     }
     while !selection.named.is_empty() {
-        let seen = if bench.is_white() {
-            Fit::of(read, selection.fit.model.clone(), selection.fit.cost)
-        } else {
-            selection.fit.clone()
-        };
+        let seen = selection.fit.as_read(bench, read);
         let Some((index, why)) = misfit(read, &seen, &hats, seed) else {
             return;
         };
