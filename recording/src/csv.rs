@@ -14,7 +14,7 @@ use crate::{
     mapping::Mapping,
     output::{Columns, WholeFile},
     series::Recording,
-    table::Table,
+    table::{self, Table},
 };
 
 /// Reads a recording.
@@ -52,8 +52,8 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
     // Lines are of about the same length.
     let expected_rows = text.len() / (header.len().max(names.len() * 4) + 1);
     let mut columns = vec![Vec::with_capacity(expected_rows); names.len()];
-    let mut line_numbers = Vec::with_capacity(expected_rows);
-    for (number, line) in lines {
+    let mut line_numbers = table::Lines::default();
+    for (row, (number, line)) in lines.enumerate() {
         let mut fields = Fields::new(line);
         for (column, (name, values)) in names.iter().zip(&mut columns).enumerate() {
             let place = || Place::field(number, column, name);
@@ -79,7 +79,7 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
                 "one for each column of the header",
             ));
         }
-        line_numbers.push(number);
+        line_numbers.push(row, number);
     }
     Table::with_lines(
         source,

@@ -14,8 +14,34 @@ use crate::{
 pub struct Table {
     source: String,
     columns: Vec<Column>,
-    /// The line of each row; empty if row `n` is simply row `n + 1` of its file.
-    lines: Vec<u64>,
+    /// Empty if row `n` is simply row `n + 1` of its file.
+    lines: Lines,
+}
+
+/// The line of each row, from 1. Rows mostly stand line by line: each run of such rows is held by its first row and that row's
+/// line.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Lines {
+    runs: Vec<(usize, u64)>,
+}
+
+impl Lines {
+    /// Says where the next row (from 0) stands.
+    pub(crate) fn push(&mut self, row: usize, line: u64) {
+        let follows = self
+            .runs
+            .last()
+            .is_some_and(|(first, of_first)| of_first + (row - first) as u64 == line);
+        if !follows {
+            self.runs.push((row, line));
+        }
+    }
+
+    fn line(&self, row: usize) -> Option<u64> {
+        let run = self.runs.partition_point(|(first, _)| *first <= row);
+        let (first, line) = self.runs.get(run.checked_sub(1)?)?;
+        Some(line + (row - first) as u64)
+    }
 }
 
 #[derive(Clone, Debug)]
@@ -29,14 +55,14 @@ struct Column {
 impl Table {
     /// A table that was not read from a file with lines; `source` is what messages call it.
     pub fn new(source: impl Into<String>, columns: Vec<(String, Vec<f64>)>) -> Result<Self> {
-        Self::with_lines(source, columns, Vec::new())
+        Self::with_lines(source, columns, Lines::default())
     }
 
     /// A table with the line of each row.
     pub(crate) fn with_lines(
         source: impl Into<String>,
         columns: Vec<(String, Vec<f64>)>,
-        lines: Vec<u64>,
+        lines: Lines,
     ) -> Result<Self> {
         let source = source.into();
         let header = |kind, found: String, expected: &str| {
@@ -127,7 +153,7 @@ impl Table {
 
     /// The line of the file that row `row` (from 0) came from, from 1; the number of the row where a file has no lines.
     pub fn line(&self, row: usize) -> u64 {
-        self.lines.get(row).copied().unwrap_or(row as u64 + 1)
+        self.lines.line(row).unwrap_or(row as u64 + 1)
     }
 
     /// An error that points at a value: `found` and `expected` end the sentence "found …, expected …".
@@ -140,7 +166,7 @@ impl Table {
         expected: impl Into<String>,
     ) -> Error {
         let number = Some(self.line(row));
-        let has_lines = !self.lines.is_empty();
+        let has_lines = !self.lines.runs.is_empty();
         let place = Place {
             line: number.filter(|_| has_lines),
             row: number.filter(|_| !has_lines),

@@ -76,8 +76,8 @@ fn drive(rows: usize, step_s: f64) -> Drive {
         sensor_temperature_c: Some(slow(400.0).iter().map(|v| 25.0 + 12.0 * v).collect()),
         supply_v: Some(slow(150.0).iter().map(|v| 5.0 + 0.1 * v).collect()),
         cell_temperature_c: Some(slow(900.0).iter().map(|v| 22.0 + 6.0 * v).collect()),
-        t_s,
-        reference,
+        t_s: t_s.into(),
+        reference: reference.into(),
         segments: vec![0..rows],
         continues: vec![false],
         ..Drive::default()

@@ -11,7 +11,7 @@ mod held;
 mod phase;
 mod series;
 
-use std::path::PathBuf;
+use std::{path::PathBuf, sync::Arc};
 
 use recording::name;
 
@@ -22,7 +22,7 @@ use crate::{
     align, explain,
     failure::Failure,
     model::{Model, Sensor, registry},
-    problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View},
+    problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, Series, View},
     report::format::count,
     simulate::board::{Board, Pace},
 };
@@ -59,7 +59,7 @@ pub struct Item {
     /// The problem.
     pub problem: Problem,
     /// Row of the recording that each observed row is from.
-    pub rows: Vec<usize>,
+    pub rows: Arc<Vec<usize>>,
     /// When the board's conversions end, for a sensor.
     pub pace: Pace,
     /// Rows at which a board's new conversion shows for the first time; empty: all.
@@ -82,7 +82,7 @@ fn squared_width(
         rows += 1.0;
         large += f64::from(u8::from(high[row] > 0.5));
         if let Some(before) = last
-            && observed.segment[before] == observed.segment[row]
+            && observed.segment_of(before) == observed.segment_of(row)
         {
             let step_s = observed.t_s[row] - observed.t_s[before];
             let slope = (base.reading[row] - base.reading[before]) / step_s;
@@ -186,9 +186,9 @@ struct Work<'a> {
     clock: Option<Vec<f64>>,
 }
 
-impl Work<'_> {
+impl<'a> Work<'a> {
     /// The frame that the reference is in.
-    fn drive_frame(&self) -> &Frame {
+    fn drive_frame(&self) -> &'a Frame {
         self.reference.unwrap_or(self.frame)
     }
 
@@ -242,7 +242,7 @@ impl Work<'_> {
         self.surroundings(&mut drive, &parts.rows);
         let (observed, rows) = match &value {
             Some(value) => self.observe(&drive, &parts.rows, &parts.clocks, value, &fresh),
-            None => series::every_row(&drive, &parts.rows),
+            None => (series::every_row(&drive), Arc::clone(&parts.rows)),
         };
         if self.purpose == Purpose::Compare && value.is_some() {
             let (errors, remarks) = (
@@ -270,15 +270,15 @@ impl Work<'_> {
             let (problem, fresh) = self.sensor_problem(
                 sensor,
                 board.as_ref(),
-                &drive,
-                &observed,
+                drive.clone(),
+                observed,
                 pace,
                 &measured,
                 &unit,
             );
             items.push(Item {
                 problem,
-                rows: rows.clone(),
+                rows,
                 pace,
                 fresh,
             });
@@ -301,15 +301,13 @@ impl Work<'_> {
         &mut self,
         sensor: &Sensor,
         board: Option<&Board>,
-        drive: &Drive,
-        observed: &Observed,
+        mut drive: Drive,
+        mut observed: Observed,
         pace: Pace,
         measured: &str,
         unit: &str,
     ) -> (Problem, Vec<bool>) {
         let mut fresh = Vec::new();
-        let mut drive = drive.clone();
-        let mut observed = observed.clone();
         let mut squares = sensor.step.powi(2);
         let mut base = SensorBase {
             window_s: sensor.window_s,
@@ -392,7 +390,7 @@ impl Work<'_> {
         }
         match &drive.range_high {
             None if observed.on_drive_rows => {
-                drive.range_high = Some(simulated.to_vec());
+                drive.range_high = Some(simulated.to_vec().into());
                 self.remark(
                     "range_high was not recorded: the simulated board's is used".to_owned(),
                 );
@@ -500,11 +498,12 @@ impl Work<'_> {
     fn surroundings(&self, drive: &mut Drive, rows: &[usize]) {
         let held = |name: &str| {
             if let Some(values) = self.drive_frame().column(name) {
-                return series::held_over_gaps(rows.iter().map(|row| values[*row]));
+                let values = rows.iter().map(|row| values[*row]);
+                return series::held_over_gaps(values).map(Series::from);
             }
             let clock = self.clock.as_ref()?;
             let values = self.frame.column(name)?;
-            series::held_at(clock, &values, &drive.t_s)
+            series::held_at(clock, &values, &drive.t_s).map(Series::from)
         };
         let surroundings = [
             "temp_sensor_c",
@@ -529,11 +528,11 @@ impl Work<'_> {
     fn observe(
         &self,
         drive: &Drive,
-        rows: &[usize],
+        rows: &Arc<Vec<usize>>,
         clocks: &[usize],
         value: &[f64],
         fresh: &Freshness,
-    ) -> (Observed, Vec<usize>) {
+    ) -> (Observed, Arc<Vec<usize>>) {
         match (&self.clock, self.reference) {
             (Some(clock), Some(_)) => series::own_rows(
                 drive,

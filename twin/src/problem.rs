@@ -3,7 +3,8 @@
 //! Recording and model file become one [`Problem`] for each signal that can be compared. Everything after that
 //! (location, effects, selection) knows nothing of files.
 
-use std::ops::Range;
+use std::ops::{Deref, DerefMut, Range};
+use std::sync::Arc;
 
 /// A signal that is compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -18,26 +19,72 @@ pub enum View {
     Voltage,
 }
 
+/// Values row by row, of which copies share the memory until one of them is written to: a long recording is held once.
+#[derive(Clone, Debug, Default)]
+pub struct Series(Arc<Vec<f64>>);
+
+impl Series {
+    /// The values, copied if others share them.
+    pub fn into_vec(self) -> Vec<f64> {
+        Arc::unwrap_or_clone(self.0)
+    }
+}
+
+impl From<Vec<f64>> for Series {
+    fn from(values: Vec<f64>) -> Self {
+        Self(Arc::new(values))
+    }
+}
+
+impl FromIterator<f64> for Series {
+    fn from_iter<I: IntoIterator<Item = f64>>(values: I) -> Self {
+        values.into_iter().collect::<Vec<f64>>().into()
+    }
+}
+
+impl Deref for Series {
+    type Target = [f64];
+
+    fn deref(&self) -> &[f64] {
+        &self.0
+    }
+}
+
+impl DerefMut for Series {
+    fn deref_mut(&mut self) -> &mut [f64] {
+        Arc::<Vec<f64>>::make_mut(&mut self.0)
+    }
+}
+
+impl<'s> IntoIterator for &'s Series {
+    type Item = &'s f64;
+    type IntoIter = std::slice::Iter<'s, f64>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.0.iter()
+    }
+}
+
 /// The drive: the reference and the environment, on the reference's own time stamps. All series have the same length.
 #[derive(Clone, Debug, Default)]
 pub struct Drive {
     /// Time in s, finite, non-decreasing within each segment.
-    pub t_s: Vec<f64>,
+    pub t_s: Series,
     /// The reference quantity, in the view's unit; for battery views the current in A, positive = discharge. Finite: rows
     /// without a reference are not part of the drive.
-    pub reference: Vec<f64>,
+    pub reference: Series,
     /// Temperature of the sensor in °C, held over gaps; `None` where it was not recorded.
-    pub sensor_temperature_c: Option<Vec<f64>>,
+    pub sensor_temperature_c: Option<Series>,
     /// Supply of the sensor in V.
-    pub supply_v: Option<Vec<f64>>,
+    pub supply_v: Option<Series>,
     /// Current of the neighbouring conductor in A.
-    pub aux_a: Option<Vec<f64>>,
+    pub aux_a: Option<Series>,
     /// Range flag: 1 where the large range measures.
-    pub range_high: Option<Vec<f64>>,
+    pub range_high: Option<Series>,
     /// Temperature of the cell in °C.
-    pub cell_temperature_c: Option<Vec<f64>>,
+    pub cell_temperature_c: Option<Series>,
     /// Temperature of the surroundings in °C.
-    pub ambient_c: Option<Vec<f64>>,
+    pub ambient_c: Option<Series>,
     /// Stretches with one clock and no gap; states (filters, charge) start anew in each, except where
     /// [`Drive::continues`] says that the clock goes on.
     pub segments: Vec<Range<usize>>,
@@ -49,25 +96,25 @@ pub struct Drive {
 #[derive(Clone, Debug, Default)]
 pub struct Observed {
     /// Time in s on the sensor's own clock; when reference and sensor share rows, the drive's time.
-    pub t_s: Vec<f64>,
+    pub t_s: Series,
     /// The reading; NaN where there is none.
     pub value: Vec<f64>,
     /// True where the reading counts: present, not a repeat of a held value, not in a drop-out, within the drive's time.
     pub valid: Vec<bool>,
-    /// Index of the drive's segment that the row belongs to.
-    pub segment: Vec<usize>,
+    /// Index of the drive's segment that the row belongs to; see [`Observed::segment_of`].
+    pub segment: Vec<u32>,
     /// True if row `k` of the observation is row `k` of the drive (same time stamps): no interpolation then.
     pub on_drive_rows: bool,
 }
 
 impl Observed {
     /// Readings on the rows of a drive of one segment, all of which count. `t_s` in s.
-    pub fn with_drive(t_s: Vec<f64>, value: Vec<f64>) -> Self {
+    pub fn with_drive(t_s: impl Into<Series>, value: Vec<f64>) -> Self {
         Self {
             valid: vec![true; value.len()],
             segment: vec![0; value.len()],
             on_drive_rows: true,
-            t_s,
+            t_s: t_s.into(),
             value,
         }
     }
@@ -228,6 +275,11 @@ impl Drive {
 }
 
 impl Observed {
+    /// Index of the drive's segment that a row belongs to.
+    pub fn segment_of(&self, row: usize) -> usize {
+        self.segment[row] as usize
+    }
+
     /// Rows that count.
     pub fn valid_rows(&self) -> usize {
         self.valid.iter().filter(|valid| **valid).count()

@@ -23,7 +23,7 @@ fn sensor(base: &SensorBase, drive: &Drive, observed: &Observed, view: View) -> 
     let mut last: Option<(usize, f64)> = None;
     (0..observed.t_s.len())
         .map(|row| {
-            let (segment, now_s) = (observed.segment[row], observed.t_s[row]);
+            let (segment, now_s) = (observed.segment_of(row), observed.t_s[row]);
             let value = match view {
                 View::Charge => {
                     let before =
@@ -68,7 +68,7 @@ fn battery(base: &BatteryBase, drive: &Drive, observed: &Observed, view: View) -
     }
     let area = Area::new(drive, &simulated, false);
     (0..observed.t_s.len())
-        .map(|row| area.value(observed.segment[row], observed.t_s[row]))
+        .map(|row| area.value(observed.segment_of(row), observed.t_s[row]))
         .collect()
 }
 

@@ -90,10 +90,10 @@ fn explained_as_read(
         name: "i_meas_a".into(),
         unit: "A".into(),
         drive: Drive {
-            t_s: truth.t_s.clone(),
-            reference: truth.current_a.clone(),
-            sensor_temperature_c: Some(truth.temperature_c.clone()),
-            range_high: Some(truth.high.clone()),
+            t_s: truth.t_s.clone().into(),
+            reference: truth.current_a.clone().into(),
+            sensor_temperature_c: Some(truth.temperature_c.clone().into()),
+            range_high: Some(truth.high.clone().into()),
             segments: std::iter::once(0..rows).collect(),
             continues: vec![false],
             ..Drive::default()

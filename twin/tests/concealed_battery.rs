@@ -110,9 +110,9 @@ fn report(
         name: "v_cell_v".into(),
         unit: "V".into(),
         drive: Drive {
-            t_s: t_s.clone(),
-            reference: current,
-            cell_temperature_c: Some(temperature),
+            t_s: t_s.clone().into(),
+            reference: current.into(),
+            cell_temperature_c: Some(temperature.into()),
             segments: std::iter::once(0..ROWS).collect(),
             continues: vec![false],
             ..Drive::default()

@@ -18,7 +18,7 @@ use twin::{
     explain,
     model::{FrontEndKind, Model},
     prepare::{Inputs, Prepared, Purpose, prepare},
-    problem::{Base, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, View},
+    problem::{Base, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, Series, View},
     simulate::{
         board::{Board, Pace},
         command::columns,
@@ -56,7 +56,8 @@ fn drive(rows: &[Row]) -> Drive {
     }
 }
 
-fn observed(t_s: Vec<f64>) -> Observed {
+fn observed(t_s: impl Into<Series>) -> Observed {
+    let t_s = t_s.into();
     let rows = t_s.len();
     Observed {
         t_s,
@@ -172,10 +173,10 @@ fn a_reading_is_the_current_within_half_a_step() {
         let board = Board::new(kind, 8).unwrap();
         let t_s: Vec<f64> = (0..200).map(|k| f64::from(k) * 0.05).collect();
         let drive = Drive {
-            reference: vec![level; 200],
+            reference: vec![level; 200].into(),
             segments: vec![0..200],
             continues: vec![false],
-            t_s: t_s.clone(),
+            t_s: t_s.clone().into(),
             ..Drive::default()
         };
         let reported = board.run(&drive, false, &observed(t_s), Pace::Free, false);
@@ -199,10 +200,10 @@ fn the_range_changes_with_hysteresis() {
     // Up to 60 A and back in 200 s.
     let reference: Vec<f64> = t_s.iter().map(|t| 60.0 - 0.6 * (t - 100.0).abs()).collect();
     let drive = Drive {
-        reference: reference.clone(),
+        reference: reference.clone().into(),
         segments: vec![0..2001],
         continues: vec![false],
-        t_s: t_s.clone(),
+        t_s: t_s.clone().into(),
         ..Drive::default()
     };
     let reported = board.run(&drive, false, &observed(t_s), Pace::Free, false);
@@ -389,7 +390,7 @@ fn swinging(rows: usize) -> Drive {
         reference: t_s.iter().map(|t| 200.0 * (2.0 * t).sin()).collect(),
         segments: std::iter::once(0..rows).collect(),
         continues: vec![false],
-        t_s,
+        t_s: t_s.into(),
         ..Drive::default()
     }
 }

@@ -135,7 +135,7 @@ impl<'a> Chain<'a> {
                     .for_each(|(value, noise)| *value += noise);
             }
         }
-        scene.signal
+        scene.signal.into_vec()
     }
 
     /// The simulation up to a member, to be gone on with for many values of it.
@@ -173,7 +173,7 @@ impl<'a> Chain<'a> {
         let links = self.links(members);
         let mut begun = begun.clone();
         self.advance(&mut begun, &links, links.len(), nuisance);
-        begun.scene.signal
+        begun.scene.signal.into_vec()
     }
 
     /// What variations of a simulation say, each through `take`: what comes before a change is run once for all of them.
@@ -255,7 +255,8 @@ impl<'a> Chain<'a> {
             Link::Window => {
                 let (held, drive) = (scene.held(), scene.drive);
                 let window_s = scene.sensor.map_or(0.0, |sensor| sensor.window_s);
-                scene.signal = boxcar(&drive.t_s, &drive.segments, &scene.signal, window_s, held);
+                scene.signal =
+                    boxcar(&drive.t_s, &drive.segments, &scene.signal, window_s, held).into();
             }
             Link::Sample => {
                 scene.delay_s +=

@@ -43,6 +43,7 @@ impl Effect for MovingAverage {
             &scene.signal,
             values[0],
             held,
-        );
+        )
+        .into();
     }
 }

@@ -71,18 +71,19 @@ impl Effect for OcvHysteresis {
         let Some(battery) = &mut scene.battery else {
             return;
         };
+        let (signal, added_v) = (&scene.signal[..], &mut battery.added_v[..]);
         let per_as = gamma / (3600.0 * battery.capacity_ah);
         for rows in drive.segments.iter().filter(|rows| !rows.is_empty()) {
             let mut h = 0.0;
             for row in rows.clone().skip(1) {
-                let i = 0.5 * (scene.signal[row] + scene.signal[row - 1]);
+                let i = 0.5 * (signal[row] + signal[row - 1]);
                 if i != 0.0 {
                     let target = -i.signum();
                     h = target
                         + (h - target)
                             * (-per_as * i.abs() * (drive.t_s[row] - drive.t_s[row - 1])).exp();
                 }
-                battery.added_v[row] += m * h;
+                added_v[row] += m * h;
             }
         }
     }

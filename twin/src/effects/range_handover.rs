@@ -55,7 +55,7 @@ impl Effect for RangeHandover {
         let mut changes = scene.changes.iter().peekable();
         let held = scene.held();
         let input = &scene.signal;
-        let mut output = input.clone();
+        let mut output = input.to_vec();
         // The low-pass over a part of a step in which its input goes from one value to another.
         let over = |state: f64, from: f64, to: f64, h: f64| {
             if h <= 0.0 {
@@ -98,6 +98,6 @@ impl Effect for RangeHandover {
                 output[row] += error;
             }
         }
-        scene.signal = output;
+        scene.signal = output.into();
     }
 }

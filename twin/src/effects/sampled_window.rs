@@ -1,6 +1,6 @@
 //! Only a part of each period is measured.
 
-use super::scene::{Cursor, Scale, Scene, floored, integral};
+use super::scene::{Integrated, Scale, Scene, floored};
 use crate::spectrum;
 
 use super::{Card, Clues, Effect, Parameter, Search, Stage};
@@ -117,14 +117,14 @@ impl Effect for SampledWindow {
         let (period, duty, phase) = (values[0], values[1], values[2]);
         let drive = scene.drive;
         let held = scene.held();
-        let total = integral(&drive.t_s, &drive.segments, &scene.signal, held);
-        let mut output = scene.signal.clone();
+        let input = &scene.signal[..];
+        let mut output = input.to_vec();
         for rows in drive.segments.iter().filter(|rows| !rows.is_empty()) {
             let start = drive.t_s[rows.start] + phase;
             // Windows go forward: one cursor for where they begin, one for where they end.
-            let mut begin = Cursor::new(&drive.t_s, rows.clone());
+            let mut begin = Integrated::new(&drive.t_s, input, rows.clone(), held);
             let mut end = begin.clone();
-            let (mut value, mut until) = (scene.signal[rows.start], f64::NEG_INFINITY);
+            let (mut value, mut until) = (input[rows.start], f64::NEG_INFINITY);
             let mut known = f64::NAN;
             for (out, t) in output[rows.clone()]
                 .iter_mut()
@@ -141,12 +141,12 @@ impl Effect for SampledWindow {
                         let from = start + ended * period;
                         let to = from + duty * period;
                         // The mean over a straight line is its value in the middle: most windows below a row are within one.
-                        let middle = end.value(&scene.signal, 0.5 * (from + to), held);
+                        let middle = end.value(0.5 * (from + to));
                         value = if end.in_step(from) && end.in_step(to) {
                             middle
                         } else {
-                            let before = begin.integral(&total, &scene.signal, from, held);
-                            let after = end.integral(&total, &scene.signal, to, held);
+                            let before = begin.integral(from);
+                            let after = end.integral(to);
                             (after - before) / (duty * period)
                         };
                     }
@@ -154,7 +154,7 @@ impl Effect for SampledWindow {
                 *out = value;
             }
         }
-        scene.signal = output;
+        scene.signal = output.into();
     }
 }
 

@@ -1,10 +1,10 @@
 //! The simulation while effects act on it: series on the drive's rows, then on the observation's.
 
 use std::collections::HashMap;
-use std::ops::{Deref, DerefMut, Range};
+use std::ops::Range;
 use std::sync::Arc;
 
-use crate::problem::{Base, BatteryBase, Drive, Observed, Problem, SensorBase, View};
+use crate::problem::{Base, BatteryBase, Drive, Observed, Problem, SensorBase, Series, View};
 
 /// Reference temperature of every temperature coefficient, in °C.
 pub const REFERENCE_C: f64 = 25.0;
@@ -59,7 +59,7 @@ pub struct Scene<'a> {
     /// Changes of the range, in order.
     pub changes: Arc<Vec<RangeChange>>,
     /// The signal: on drive rows before [`super::Stage::Output`], then on the observation's rows.
-    pub signal: Vec<f64>,
+    pub signal: Series,
     /// Transport delay in s.
     pub delay_s: f64,
     /// The sensor's clock runs fast by this, in 1.
@@ -68,39 +68,6 @@ pub struct Scene<'a> {
     pub sensor: Option<&'a SensorBase>,
     /// The battery in the making.
     pub battery: Option<Battery<'a>>,
-}
-
-/// A series that simulations share until one of them writes to it.
-#[derive(Clone, Debug, Default)]
-pub struct Series(Arc<Vec<f64>>);
-
-impl From<Vec<f64>> for Series {
-    fn from(values: Vec<f64>) -> Self {
-        Self(Arc::new(values))
-    }
-}
-
-impl Deref for Series {
-    type Target = [f64];
-
-    fn deref(&self) -> &[f64] {
-        &self.0
-    }
-}
-
-impl DerefMut for Series {
-    fn deref_mut(&mut self) -> &mut [f64] {
-        Arc::<Vec<f64>>::make_mut(&mut self.0)
-    }
-}
-
-impl<'s> IntoIterator for &'s Series {
-    type Item = &'s f64;
-    type IntoIter = std::slice::Iter<'s, f64>;
-
-    fn into_iter(self) -> Self::IntoIter {
-        self.0.iter()
-    }
 }
 
 /// State of the battery simulation on drive rows; the scene's `signal` is the current in A.
@@ -127,7 +94,7 @@ pub struct Battery<'a> {
     /// Factor on every resistance.
     pub factor: Series,
     /// Voltage added to open circuit and ohmic drop, in V.
-    pub added_v: Vec<f64>,
+    pub added_v: Series,
 }
 
 /// A change of the range in use.
@@ -402,28 +369,84 @@ impl Steps {
     }
 }
 
-/// Integral over time from the start of each segment: trapezoids, or the last value held.
+/// Integral over the step that begins at a row: a trapezoid, or the value held.
+#[inline]
+fn area(t_s: &[f64], input: &[f64], row: usize, held: bool) -> f64 {
+    let mean = if held {
+        input[row]
+    } else {
+        0.5 * (input[row + 1] + input[row])
+    };
+    mean * (t_s[row + 1] - t_s[row])
+}
+
+/// Integral over time from the start of each segment, over each step as [`area`].
 pub fn integral(t_s: &[f64], segments: &[Range<usize>], input: &[f64], held: bool) -> Vec<f64> {
     let mut output = vec![0.0; input.len()];
     for rows in segments.iter().filter(|rows| !rows.is_empty()) {
         let mut sum = 0.0;
-        let steps = t_s[rows.clone()].windows(2);
-        let pairs = input[rows.clone()].windows(2);
-        for ((out, times), pair) in output[rows.start + 1..rows.end]
-            .iter_mut()
-            .zip(steps)
-            .zip(pairs)
-        {
-            let mean = if held {
-                pair[0]
-            } else {
-                0.5 * (pair[1] + pair[0])
-            };
-            sum += mean * (times[1] - times[0]);
+        let (t_s, input) = (&t_s[rows.clone()], &input[rows.clone()]);
+        for (row, out) in output[rows.start + 1..rows.end].iter_mut().enumerate() {
+            sum += area(t_s, input, row, held);
             *out = sum;
         }
     }
     output
+}
+
+/// The integral of a series at times that go forward, without holding it for every row.
+#[derive(Clone, Debug)]
+pub struct Integrated<'a> {
+    cursor: Cursor<'a>,
+    input: &'a [f64],
+    held: bool,
+    /// Integral from the start of the segment to the cursor's row.
+    sum: f64,
+}
+
+impl<'a> Integrated<'a> {
+    /// Over one segment, as [`integral`].
+    pub fn new(t_s: &'a [f64], input: &'a [f64], rows: Range<usize>, held: bool) -> Self {
+        Self {
+            cursor: Cursor::new(t_s, rows),
+            input,
+            held,
+            sum: 0.0,
+        }
+    }
+
+    fn seek(&mut self, t: f64) {
+        let from = self.cursor.at;
+        self.cursor.seek(t);
+        let to = self.cursor.at;
+        let area = |row| area(self.cursor.t_s, self.input, row, self.held);
+        if to < from {
+            self.sum -= (to..from).map(area).sum::<f64>();
+        } else {
+            // One after the other, as the whole integral is summed.
+            self.sum = (from..to).map(area).fold(self.sum, |sum, area| sum + area);
+        }
+    }
+
+    /// Value at a time, see [`Cursor::value`].
+    #[inline]
+    pub fn value(&mut self, t: f64) -> f64 {
+        self.seek(t);
+        self.cursor.value(self.input, t, self.held)
+    }
+
+    /// Integral at a time, see [`Cursor::integral`].
+    #[inline]
+    pub fn integral(&mut self, t: f64) -> f64 {
+        self.seek(t);
+        self.cursor.beyond(self.sum, self.input, t, self.held)
+    }
+
+    /// See [`Cursor::in_step`].
+    #[inline]
+    pub fn in_step(&self, t: f64) -> bool {
+        self.cursor.in_step(t)
+    }
 }
 
 /// A place to look values up between rows, for times that mostly go forward.
@@ -472,18 +495,21 @@ impl<'a> Cursor<'a> {
     #[inline]
     pub fn integral(&mut self, integral: &[f64], series: &[f64], t: f64, held: bool) -> f64 {
         self.seek(t);
+        self.beyond(integral[self.at], series, t, held)
+    }
+
+    /// The integral at a time from what it is at the row where the cursor stands.
+    #[inline]
+    fn beyond(&self, integral: f64, series: &[f64], t: f64, held: bool) -> f64 {
         let at = self.at;
         let h = t - self.t_s[at];
-        if h <= 0.0 {
-            // Before the first row.
-            return integral[at] + series[at] * h;
-        }
-        if at + 1 >= self.rows.end || held {
-            return integral[at] + series[at] * h;
+        // Before the first row, behind the last one.
+        if h <= 0.0 || at + 1 >= self.rows.end || held {
+            return integral + series[at] * h;
         }
         let step = self.t_s[at + 1] - self.t_s[at];
         let end = series[at] + (series[at + 1] - series[at]) * (h / step);
-        integral[at] + 0.5 * (series[at] + end) * h
+        integral + 0.5 * (series[at] + end) * h
     }
 
     /// Whether a time is in the step that begins at the row where the cursor stands.
@@ -505,26 +531,27 @@ pub fn boxcar(
     if window_s.is_nan() || window_s <= 0.0 {
         return output;
     }
-    let total = integral(t_s, segments, input, held);
     for rows in segments {
-        let (t, x, total) = (
-            &t_s[rows.clone()],
-            &input[rows.clone()],
-            &total[rows.clone()],
-        );
-        // The row that the window begins after: times go forward within a segment.
-        let mut at = 0;
-        for ((out, now), until) in output[rows.clone()].iter_mut().zip(t).zip(total) {
-            let begin = now - window_s;
+        let (t, x) = (&t_s[rows.clone()], &input[rows.clone()]);
+        // The row that the window begins after (times go forward within a segment), and the integral up to it.
+        let (mut at, mut before) = (0, 0.0);
+        // The integral up to the row where it ends.
+        let mut until = 0.0;
+        for (row, out) in output[rows.clone()].iter_mut().enumerate() {
+            if row > 0 {
+                until += area(t, x, row - 1, held);
+            }
+            let begin = t[row] - window_s;
             while at + 1 < t.len() && t[at + 1] <= begin {
+                before += area(t, x, at, held);
                 at += 1;
             }
             let h = begin - t[at];
             let start = if h <= 0.0 || held || at + 1 >= t.len() {
-                total[at] + x[at] * h
+                before + x[at] * h
             } else {
                 let end = x[at] + (x[at + 1] - x[at]) * (h / (t[at + 1] - t[at]));
-                total[at] + 0.5 * (x[at] + end) * h
+                before + 0.5 * (x[at] + end) * h
             };
             *out = (until - start) / window_s;
         }
@@ -634,7 +661,8 @@ impl<'a> Scene<'a> {
         for readings in observed.segment.chunk_by(|a, b| a == b) {
             let these = from..from + readings.len();
             from = these.end;
-            let rows = drive.segments.get(readings[0]).cloned();
+            let segment = readings[0] as usize;
+            let rows = drive.segments.get(segment).cloned();
             let Some(rows) = rows.filter(|rows| !rows.is_empty()) else {
                 continue;
             };
@@ -648,7 +676,7 @@ impl<'a> Scene<'a> {
             let mut cursor = Cursor::new(&drive.t_s, rows);
             let times = &observed.t_s[these.clone()];
             let values = &mut sampled[these.clone()];
-            if let Some(Some(step_s)) = self.steps.even_s.get(readings[0])
+            if let Some(Some(step_s)) = self.steps.even_s.get(segment)
                 && (these.start, these.end) == even_rows
             {
                 let steps = delay_s / step_s;
@@ -667,8 +695,8 @@ impl<'a> Scene<'a> {
                 }
                 continue;
             };
-            if known.0 != readings[0] {
-                known = (readings[0], None);
+            if known.0 != segment {
+                known = (segment, None);
             }
             let last = &mut known.1;
             for ((value, t), valid) in values.iter_mut().zip(times).zip(&observed.valid[these]) {
@@ -684,7 +712,7 @@ impl<'a> Scene<'a> {
                 }
             }
         }
-        self.signal = sampled;
+        self.signal = sampled.into();
     }
 }
 
@@ -695,7 +723,7 @@ impl<'a> Battery<'a> {
             .cell_temperature_c
             .clone()
             .or_else(|| drive.ambient_c.clone())
-            .unwrap_or_else(|| vec![REFERENCE_C; rows]);
+            .unwrap_or_else(|| vec![REFERENCE_C; rows].into());
         Self {
             base,
             capacity_ah: base.capacity_ah,
@@ -708,10 +736,10 @@ impl<'a> Battery<'a> {
             resistance: 1.0,
             soc: Series::default(),
             open_circuit_v: Series::default(),
-            temperature_c: temperature_c.into(),
+            temperature_c,
             arrhenius_k: None,
             factor: vec![1.0; rows].into(),
-            added_v: vec![0.0; rows],
+            added_v: vec![0.0; rows].into(),
         }
     }
 

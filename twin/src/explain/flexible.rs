@@ -232,7 +232,7 @@ fn at_rows(bench: &Workbench<'_>, rows: &[usize], series: &[f64], earlier_s: f64
     rows.iter()
         .map(|&index| {
             let row = bench.rows[index];
-            let segment = observed.segment[row];
+            let segment = observed.segment_of(row);
             let Some(range) = drive
                 .segments
                 .get(segment)

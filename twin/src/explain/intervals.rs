@@ -422,7 +422,7 @@ mod tests {
             name: "i_meas_a".into(),
             unit: "A".into(),
             drive: Drive {
-                t_s: t_s.clone(),
+                t_s: t_s.clone().into(),
                 reference: t_s.iter().map(|t| current_a(*t)).collect(),
                 segments: std::iter::once(0..ROWS).collect(),
                 continues: vec![false],

@@ -110,7 +110,7 @@ fn at_rows(bench: &Workbench<'_>, series: &[f64]) -> Vec<f64> {
         .rows
         .iter()
         .map(|&row| {
-            let segment = observed.segment[row];
+            let segment = observed.segment_of(row);
             let Some(range) = drive
                 .segments
                 .get(segment)

@@ -150,15 +150,31 @@ impl<'a> Workbench<'a> {
         let chain = Chain::new(problem);
         let all = chain.run(&[], Nuisance::default());
         let observed = &problem.observed;
-        let valid: Vec<usize> = (0..observed.t_s.len())
-            .filter(|&row| {
+        let valid = || {
+            (0..observed.t_s.len()).filter(|&row| {
                 observed.valid[row] && observed.value[row].is_finite() && all[row].is_finite()
             })
-            .collect();
-        let stride = valid.len().div_ceil(MOST_ROWS).max(1);
-        let rows: Vec<usize> = valid.iter().copied().step_by(stride).collect();
+        };
+        let stride = valid().count().div_ceil(MOST_ROWS).max(1);
+        let rows: Vec<usize> = valid().step_by(stride).collect();
         let at = |series: &[f64]| rows.iter().map(|&row| series[row]).collect::<Vec<f64>>();
         let (t_s, y, plain) = (at(&observed.t_s), at(&observed.value), at(&all));
+        let modelled = (0..problem.modelled.len())
+            .map(|index| {
+                let (id, values) = &problem.modelled[index];
+                let share = find_with(id, values.len()).map_or(0.0, |effect| effect.idealised());
+                let mut without = problem.clone();
+                without.modelled.remove(index);
+                let without = Chain::new(&without).run(&[], Nuisance::default());
+                let energy: f64 = rows
+                    .iter()
+                    .map(|&row| (all[row] - without[row]).powi(2))
+                    .filter(|change| change.is_finite())
+                    .sum();
+                share * share * energy
+            })
+            .sum();
+        drop(all);
         let reference = match &problem.base {
             Base::Sensor(_) => plain.clone(),
             // Battery views are read on the drive's rows or between them: the nearest is near enough for regions.
@@ -178,21 +194,6 @@ impl<'a> Workbench<'a> {
                     && !problem.modelled.iter().any(|(known, _)| *known == id)
             })
             .collect();
-        let modelled = (0..problem.modelled.len())
-            .map(|index| {
-                let (id, values) = &problem.modelled[index];
-                let share = find_with(id, values.len()).map_or(0.0, |effect| effect.idealised());
-                let mut without = problem.clone();
-                without.modelled.remove(index);
-                let without = Chain::new(&without).run(&[], Nuisance::default());
-                let energy: f64 = rows
-                    .iter()
-                    .map(|&row| (all[row] - without[row]).powi(2))
-                    .filter(|change| change.is_finite())
-                    .sum();
-                share * share * energy
-            })
-            .sum();
         Self {
             problem,
             chain,
@@ -455,7 +456,7 @@ fn nearest(problem: &Problem, rows: &[usize]) -> Vec<f64> {
             if observed.on_drive_rows {
                 return drive.reference[row];
             }
-            let Some(range) = drive.segments.get(observed.segment[row]) else {
+            let Some(range) = drive.segments.get(observed.segment_of(row)) else {
                 return 0.0;
             };
             let times = &drive.t_s[range.clone()];
@@ -490,6 +491,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         .reference
         .iter()
         .fold(0.0f64, |most, x| most.max(x.abs()));
+    let step_s = drive.median_step_s();
     let mut steps: Vec<f64> = t_s
         .windows(2)
         .map(|pair| pair[1] - pair[0])
@@ -497,7 +499,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         .collect();
     let middle = steps.len() / 2;
     let reading_step_s = if steps.is_empty() {
-        drive.median_step_s()
+        step_s
     } else {
         *steps.select_nth_unstable_by(middle, f64::total_cmp).1
     };
@@ -512,7 +514,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         rms: rms(drive.reference.iter().copied()),
         full_scale: largest.max(y.iter().fold(0.0f64, |most, value| most.max(value.abs()))),
         mismatch: rms(y.iter().zip(plain).map(|(y, p)| y - p)),
-        step_s: drive.median_step_s(),
+        step_s,
         reading_step_s,
         even_s: match t_s {
             [first, .., last] if reading_step_s > 0.0 => {
@@ -520,7 +522,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
             }
             _ => reading_step_s,
         },
-        fastest_s: 0.02 * drive.median_step_s().min(reading_step_s),
+        fastest_s: 0.02 * step_s.min(reading_step_s),
         span_s,
         ..Scale::default()
     };

@@ -1,5 +1,7 @@
 //! A battery's state of charge and voltage.
 
+use std::sync::Arc;
+
 use super::{Item, Purpose, Work, checks, held::Freshness, series};
 use crate::{
     effects::scene::mean_flow,
@@ -71,7 +73,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
                 }
                 work.observe(&drive, &parts.rows, &parts.clocks, value, &every)
             }
-            None => series::every_row(&drive, &parts.rows),
+            None => (series::every_row(&drive), Arc::clone(&parts.rows)),
         };
         let cells = if name == PACK {
             f64::from(battery.cells)
@@ -241,7 +243,7 @@ fn seen(
     view: View,
 ) -> Option<(f64, f64)> {
     let row = (0..observed.t_s.len())
-        .find(|row| observed.valid[*row] && observed.segment[*row] == segment)?;
+        .find(|row| observed.valid[*row] && observed.segment_of(*row) == segment)?;
     let value = observed.value[row];
     if view == View::StateOfCharge {
         return Some((value / 100.0, 0.005));

@@ -1,5 +1,7 @@
 //! The charge counter: differences of its readings over time, as mean currents.
 
+use std::sync::Arc;
+
 use core_logic::design_parameters::METER_POLL_MS;
 
 use super::{FEWEST_ROWS, Item, Purpose, Work, checks, phase, series};
@@ -95,9 +97,9 @@ pub(super) fn item(
         observed.t_s.iter_mut().for_each(|t| *t -= later_s);
         base.reading = reported.current_a;
         if drive.range_high.is_none() && board.has_two_ranges() {
-            let (every, _) = series::every_row(&drive, &[]);
+            let every = series::every_row(&drive);
             let flag = board.run(&drive, sensor.held_reference, &every, Pace::Free, false);
-            drive.range_high = Some(flag.range_high);
+            drive.range_high = Some(flag.range_high.into());
         }
     }
     let problem = Problem {
@@ -121,7 +123,7 @@ pub(super) fn item(
     };
     Ok(Some(Item {
         problem,
-        rows,
+        rows: Arc::new(rows),
         pace: Pace::Seen,
         fresh: Vec::new(),
     }))
@@ -139,7 +141,7 @@ fn differences(
 ) -> (Drive, Observed, Vec<usize>, usize) {
     let mut drive = drive.clone();
     let mut observed = Observed::default();
-    let mut kept = Vec::new();
+    let (mut kept, mut times_s) = (Vec::new(), Vec::new());
     let mut resets = 0;
     // Segments are renumbered where one is cut.
     let mut shift = 0;
@@ -150,7 +152,7 @@ fn differences(
         .filter(|(index, _)| readings.valid[*index])
     {
         let (segment, now_s, charge) = (
-            readings.segment[index],
+            readings.segment_of(index),
             readings.t_s[index],
             readings.value[index],
         );
@@ -178,12 +180,13 @@ fn differences(
             }
         }
         last = Some((segment, now_s, charge));
-        observed.t_s.push(now_s);
+        times_s.push(now_s);
         observed.value.push(mean);
         observed.valid.push(mean.is_finite());
-        observed.segment.push(segment + shift);
+        observed.segment.push((segment + shift) as u32);
         kept.push(*row);
     }
+    observed.t_s = times_s.into();
     (drive, observed, kept, resets)
 }
 
@@ -192,7 +195,7 @@ fn means(observed: &Observed, charge_c: &[f64]) -> Vec<f64> {
     let mut last: Option<(usize, f64, f64)> = None;
     (0..charge_c.len())
         .map(|row| {
-            let now = (observed.segment[row], observed.t_s[row], charge_c[row]);
+            let now = (observed.segment_of(row), observed.t_s[row], charge_c[row]);
             let mean = match last {
                 Some((segment, before_s, before_c)) if segment == now.0 && now.1 > before_s => {
                     (now.2 - before_c) / (now.1 - before_s)

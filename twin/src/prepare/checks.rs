@@ -81,19 +81,20 @@ fn shown(t_s: f64) -> f64 {
     (t_s * 1e6).round() / 1e6
 }
 
-/// Readings that count with the reference at their time.
-pub(super) fn beside(drive: &Drive, observed: &Observed) -> (Vec<f64>, Vec<f64>) {
-    let mut pairs = (Vec::new(), Vec::new());
-    for row in (0..observed.t_s.len()).filter(|row| observed.valid[*row]) {
+/// The reference at each reading that counts, and the reading.
+fn beside<'a>(
+    drive: &'a Drive,
+    observed: &'a Observed,
+) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
+    let counted = (0..observed.t_s.len()).filter(|row| observed.valid[*row]);
+    counted.map(|row| {
         let reference = if observed.on_drive_rows {
             drive.reference[row]
         } else {
-            at(drive, observed.segment[row], observed.t_s[row])
+            at(drive, observed.segment_of(row), observed.t_s[row])
         };
-        pairs.0.push(reference);
-        pairs.1.push(observed.value[row]);
-    }
-    pairs
+        (reference, observed.value[row])
+    })
 }
 
 fn at(drive: &Drive, segment: usize, t_s: f64) -> f64 {
@@ -114,31 +115,34 @@ fn at(drive: &Drive, segment: usize, t_s: f64) -> f64 {
 }
 
 /// Distance between the 2nd and the 98th percentile.
-fn spread(values: &[f64]) -> f64 {
-    let mut sorted: Vec<f64> = values
-        .iter()
-        .copied()
-        .filter(|value| value.is_finite())
-        .collect();
-    if sorted.len() < 2 {
+fn spread(values: impl Iterator<Item = f64>) -> f64 {
+    let mut known: Vec<f64> = values.filter(|value| value.is_finite()).collect();
+    if known.len() < 2 {
         return 0.0;
     }
-    sorted.sort_by(f64::total_cmp);
-    let at = |share: f64| sorted[((sorted.len() - 1) as f64 * share).round() as usize];
+    let last = known.len() - 1;
+    let mut at = |share: f64| {
+        let place = (last as f64 * share).round() as usize;
+        *known.select_nth_unstable_by(place, f64::total_cmp).1
+    };
     let wide = at(0.98) - at(0.02);
     if wide > 0.0 { wide } else { at(1.0) - at(0.0) }
 }
 
 /// Pearson's correlation; 0 where one does not move.
-pub(super) fn correlation(one: &[f64], other: &[f64]) -> f64 {
-    let count = one.len().min(other.len()) as f64;
+fn correlation(pairs: impl Iterator<Item = (f64, f64)> + Clone) -> f64 {
+    let (mut count, mut sum_one, mut sum_other) = (0.0, 0.0, 0.0);
+    for (x, y) in pairs.clone() {
+        count += 1.0;
+        sum_one += x;
+        sum_other += y;
+    }
     if count < 2.0 {
         return 0.0;
     }
-    let mean = |values: &[f64]| values.iter().sum::<f64>() / count;
-    let (mean_one, mean_other) = (mean(one), mean(other));
+    let (mean_one, mean_other) = (sum_one / count, sum_other / count);
     let (mut cross, mut square_one, mut square_other) = (0.0, 0.0, 0.0);
-    for (x, y) in one.iter().zip(other) {
+    for (x, y) in pairs {
         let (x, y) = (x - mean_one, y - mean_other);
         cross += x * y;
         square_one += x * x;
@@ -168,11 +172,12 @@ pub(super) fn pair(
     reference: &str,
     measured: &str,
 ) -> Result<(), Failure> {
-    let (x, y) = beside(drive, observed);
-    if x.len() < FEWEST_ROWS {
+    let pairs = beside(drive, observed);
+    if pairs.clone().count() < FEWEST_ROWS {
         return Ok(());
     }
-    let (spread_x, spread_y) = (spread(&x), spread(&y));
+    let spread_x = spread(pairs.clone().map(|(reference, _)| reference));
+    let spread_y = spread(pairs.clone().map(|(_, reading)| reading));
     if let Some(power) = thousands(spread_x / spread_y) {
         let (large, small) = if power > 0 {
             (reference, measured)
@@ -187,7 +192,7 @@ pub(super) fn pair(
             spread_x.min(spread_y)
         )));
     }
-    let together = correlation(&x, &y);
+    let together = correlation(pairs);
     if together < OPPOSITE {
         return Err(Failure::Input(format!(
             "{measured} falls where {reference} rises (correlation {together:.2}): found opposite signs, expected \
@@ -206,11 +211,11 @@ pub(super) fn plausible(
     measured: &str,
 ) -> Vec<String> {
     let mut remarks = Vec::new();
-    let (x, y) = beside(drive, observed);
-    if x.len() < FEWEST_ROWS {
+    let pairs = beside(drive, observed);
+    if pairs.clone().count() < FEWEST_ROWS {
         return remarks;
     }
-    let together = correlation(&x, &y);
+    let together = correlation(pairs.clone());
     if together.abs() < UNRELATED {
         remarks.push(format!(
             "{measured} does not follow {reference} (correlation {together:.2}): the reference may be that of another conductor"
@@ -233,34 +238,32 @@ pub(super) fn plausible(
             ));
         }
     }
-    remarks.extend(clipped(&x, &y, measured));
+    remarks.extend(clipped(pairs, measured));
     remarks.extend(spikes(drive, observed, reference));
     remarks.extend(stuck(drive, observed, reference, measured));
     remarks
 }
 
 /// Readings that stand at their highest or lowest value while the reference moves.
-fn clipped(x: &[f64], y: &[f64], measured: &str) -> Vec<String> {
-    let (low, high) = y
-        .iter()
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
-            (low.min(*value), high.max(*value))
-        });
+fn clipped(pairs: impl Iterator<Item = (f64, f64)> + Clone, measured: &str) -> Vec<String> {
+    let readings = pairs.clone().count();
+    let (low, high) = pairs.clone().fold(
+        (f64::INFINITY, f64::NEG_INFINITY),
+        |(low, high), (_, reading)| (low.min(reading), high.max(reading)),
+    );
     let mut remarks = Vec::new();
     for (end, what) in [(high, "highest"), (low, "lowest")] {
-        let inside: Vec<f64> = x
-            .iter()
-            .zip(y)
-            .filter(|(_, value)| **value == end)
-            .map(|(reference, _)| *reference)
-            .collect();
-        let enough = inside.len() >= 5 && inside.len() as f64 >= CLIPPED_SHARE * y.len() as f64;
+        let references = pairs.clone().map(|(reference, _)| reference);
+        let inside = pairs
+            .clone()
+            .filter(|(_, reading)| *reading == end)
+            .map(|(reference, _)| reference);
+        let count = inside.clone().count();
+        let enough = count >= 5 && count as f64 >= CLIPPED_SHARE * readings as f64;
         // At rest every reading may be the lowest one: then the reference does not move there either.
-        if enough && spread(&inside) > 0.02 * spread(x) {
+        if enough && spread(inside) > 0.02 * spread(references) {
             remarks.push(format!(
-                "{measured} stands at its {what} value {end} in {} of {} readings: it may be clipped",
-                inside.len(),
-                y.len()
+                "{measured} stands at its {what} value {end} in {count} of {readings} readings: it may be clipped"
             ));
         }
     }
@@ -282,7 +285,8 @@ fn spikes(drive: &Drive, observed: &Observed, reference: &str) -> Option<String>
         })
         .collect();
     let typical = median(&mut steps)?;
-    let wide = spread(&drive.reference);
+    drop(steps);
+    let wide = spread(drive.reference.iter().copied());
     let mut found = Vec::new();
     for rows in &drive.segments {
         for row in rows.start + 1..rows.end.saturating_sub(1) {
@@ -313,7 +317,7 @@ fn stuck(drive: &Drive, observed: &Observed, reference: &str, measured: &str) ->
     if !observed.on_drive_rows {
         return None;
     }
-    let wide = spread(&observed.value);
+    let wide = spread(observed.value.iter().copied());
     for rows in &drive.segments {
         let mut start = rows.start;
         while start < rows.end {
@@ -321,11 +325,10 @@ fn stuck(drive: &Drive, observed: &Observed, reference: &str, measured: &str) ->
             while end < rows.end && drive.reference[end] == drive.reference[start] {
                 end += 1;
             }
-            let inside: Vec<f64> = (start..end)
+            let inside = (start..end)
                 .filter(|row| observed.valid[*row])
-                .map(|row| observed.value[row])
-                .collect();
-            if inside.len() >= 20 && spread(&inside) > 0.3 * wide {
+                .map(|row| observed.value[row]);
+            if inside.clone().count() >= 20 && spread(inside) > 0.3 * wide {
                 return Some(format!(
                     "{reference} stands at {} for {} from {} s on while {measured} moves: the reference may be at fault",
                     drive.reference[start],
@@ -348,12 +351,12 @@ pub(super) fn battery(
     name: &str,
     current: &str,
 ) -> Result<(), Failure> {
-    let (x, y) = beside(drive, observed);
-    if y.len() < FEWEST_ROWS {
+    let pairs = beside(drive, observed);
+    if pairs.clone().count() < FEWEST_ROWS {
         return Ok(());
     }
     if view == View::StateOfCharge {
-        let most = y.iter().fold(0.0_f64, |most, soc| most.max(soc.abs()));
+        let most = pairs.fold(0.0_f64, |most, (_, soc)| most.max(soc.abs()));
         if most <= 1.01 {
             return Err(Failure::Input(format!(
                 "{name}: found values up to {most}, expected per cent, 0 to 100"
@@ -361,7 +364,7 @@ pub(super) fn battery(
         }
         return Ok(());
     }
-    let mut volts = y.clone();
+    let mut volts: Vec<f64> = pairs.clone().map(|(_, volts)| volts).collect();
     let mut table: Vec<f64> = base.ocv.iter().map(|(_, volts)| *volts).collect();
     let (Some(middle), Some(designed)) = (median(&mut volts), median(&mut table)) else {
         return Ok(());
@@ -373,9 +376,11 @@ pub(super) fn battery(
         )));
     }
     // From one reading to the next the slow open-circuit voltage hardly matters.
-    let steps =
-        |values: &[f64]| -> Vec<f64> { values.windows(2).map(|pair| pair[1] - pair[0]).collect() };
-    let together = correlation(&steps(&x), &steps(&y));
+    let next = pairs.clone().skip(1);
+    let steps = pairs
+        .zip(next)
+        .map(|(from, to)| (to.0 - from.0, to.1 - from.1));
+    let together = correlation(steps);
     if together > -OPPOSITE {
         return Err(Failure::Input(format!(
             "{name} rises where {current} rises (correlation {together:.2}): found charging positive, expected discharge \

@@ -1,6 +1,6 @@
 //! A recording under the names of the model file, with its signs.
 
-use std::{collections::HashSet, fs::File, io::Read, ops::Range, path::Path};
+use std::{borrow::Cow, collections::HashSet, fs::File, io::Read, ops::Range, path::Path};
 
 use recording::{Error, Mapping, Recording, Table, convert::Format, csv, parquet};
 
@@ -40,16 +40,17 @@ impl Frame {
     }
 
     /// A column, NaN where a value is missing.
-    pub fn column(&self, name: &str) -> Option<Vec<f64>> {
+    pub fn column(&self, name: &str) -> Option<Cow<'_, [f64]>> {
         let values = self.recording.column(name)?;
-        if self.negated.contains(name) {
-            return Some(values.iter().map(|value| -value).collect());
-        }
-        Some(values.to_vec())
+        Some(if self.negated.contains(name) {
+            values.iter().map(|value| -value).collect()
+        } else {
+            values.into()
+        })
     }
 
     /// A column that must be there.
-    pub fn need(&self, name: &str) -> Result<Vec<f64>, Failure> {
+    pub fn need(&self, name: &str) -> Result<Cow<'_, [f64]>, Failure> {
         self.recording.need(name)?;
         Ok(self.column(name).unwrap_or_default())
     }

@@ -43,23 +43,8 @@ pub fn freshness(
 ) -> Freshness {
     let t_s = frame.t_s();
     let rows = value.len();
-    // Pairs of successive readings of one clock.
-    let mut pairs = Vec::new();
-    for clock in frame.clocks() {
-        let known: Vec<usize> = clock
-            .clone()
-            .filter(|row| value[*row].is_finite())
-            .collect();
-        pairs.extend(known.windows(2).map(|pair| (pair[0], pair[1])));
-    }
-    let mut steps: Vec<f64> = pairs
-        .iter()
-        .map(|(before, after)| (value[*after] - value[*before]).abs())
-        .filter(|step| *step > 0.0)
-        .collect();
-    steps.sort_by(f64::total_cmp);
-    // The smallest step there is; not the very smallest, which may be rounding.
-    let Some(step) = steps.get(steps.len() / 100).copied() else {
+    let pairs = || pairs(frame, value);
+    let Some(step) = smallest_step(pairs(), value) else {
         return Freshness::all(rows);
     };
     let (low, high) = value
@@ -68,7 +53,7 @@ pub fn freshness(
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
             (low.min(*value), high.max(*value))
         });
-    let favourite = most_repeated(&pairs, value);
+    let favourite = most_repeated(pairs(), value);
     let moves = |before: usize, after: usize| {
         if beside {
             (reference[after] - reference[before]).abs() > MOVING_STEPS * step
@@ -77,20 +62,20 @@ pub fn freshness(
         }
     };
     let (mut moved, mut repeated) = (0_usize, 0_usize);
-    for (before, after) in &pairs {
-        let now = value[*before];
+    for (before, after) in pairs() {
+        let now = value[before];
         let special = now == low || now == high || Some(now) == favourite;
-        if special || !moves(*before, *after) {
+        if special || !moves(before, after) {
             continue;
         }
         moved += 1;
-        repeated += usize::from(value[*before] == value[*after]);
+        repeated += usize::from(value[before] == value[after]);
     }
-    let mut apart: Vec<f64> = pairs
-        .iter()
-        .map(|(before, after)| t_s[*after] - t_s[*before])
+    let mut apart: Vec<f64> = pairs()
+        .map(|(before, after)| t_s[after] - t_s[before])
         .collect();
     let is_stated = median(&mut apart).is_some_and(|step_s| step_s < 0.75 * stated_s);
+    drop(apart);
     let is_seen = moved >= 10 && repeated as f64 >= HELD_SHARE * moved as f64;
     if !is_stated && !is_seen {
         return Freshness::all(rows);
@@ -100,18 +85,18 @@ pub fn freshness(
     let mut spans = Vec::new();
     let mut fresh = vec![false; rows];
     let mut before_row = usize::MAX;
-    for (before, after) in &pairs {
-        if *before != before_row {
+    for (before, after) in pairs() {
+        if before != before_row {
             // The first reading of a clock.
-            fresh[*before] = true;
+            fresh[before] = true;
             last_change = None;
         }
-        before_row = *after;
-        if value[*after] != value[*before] {
+        before_row = after;
+        if value[after] != value[before] {
             if let Some(since) = last_change {
-                spans.push(t_s[*after] - since);
+                spans.push(t_s[after] - since);
             }
-            last_change = Some(t_s[*after]);
+            last_change = Some(t_s[after]);
         }
     }
     let interval_s = if is_stated {
@@ -122,15 +107,15 @@ pub fn freshness(
     // A value that stays longer was measured again and came out the same: once for each interval.
     let mut last_fresh = f64::NEG_INFINITY;
     before_row = usize::MAX;
-    for (before, after) in &pairs {
-        if *before != before_row {
-            last_fresh = t_s[*before];
+    for (before, after) in pairs() {
+        if before != before_row {
+            last_fresh = t_s[before];
         }
-        before_row = *after;
-        let since = t_s[*after] - last_fresh;
-        if value[*after] != value[*before] || since >= 1.5 * interval_s {
-            fresh[*after] = true;
-            last_fresh = t_s[*after];
+        before_row = after;
+        let since = t_s[after] - last_fresh;
+        if value[after] != value[before] || since >= 1.5 * interval_s {
+            fresh[after] = true;
+            last_fresh = t_s[after];
         }
     }
     Freshness {
@@ -139,14 +124,37 @@ pub fn freshness(
     }
 }
 
-/// The value that is repeated most.
-fn most_repeated(pairs: &[(usize, usize)], value: &[f64]) -> Option<f64> {
-    let mut repeats: Vec<f64> = pairs
-        .iter()
-        .filter(|(before, after)| value[*before] == value[*after])
-        .map(|(before, _)| value[*before])
+/// Rows of successive readings of one clock.
+fn pairs<'a>(frame: &'a Frame, value: &'a [f64]) -> impl Iterator<Item = (usize, usize)> + 'a {
+    frame.clocks().iter().flat_map(move |clock| {
+        let mut last = None;
+        clock
+            .clone()
+            .filter(move |row| value[*row].is_finite())
+            .filter_map(move |row| last.replace(row).map(|before| (before, row)))
+    })
+}
+
+/// The smallest step there is; not the very smallest, which may be rounding.
+fn smallest_step(pairs: impl Iterator<Item = (usize, usize)>, value: &[f64]) -> Option<f64> {
+    let mut steps: Vec<f64> = pairs
+        .map(|(before, after)| (value[after] - value[before]).abs())
+        .filter(|step| *step > 0.0)
         .collect();
-    repeats.sort_by(f64::total_cmp);
+    if steps.is_empty() {
+        return None;
+    }
+    let few = steps.len() / 100;
+    Some(*steps.select_nth_unstable_by(few, f64::total_cmp).1)
+}
+
+/// The value that is repeated most.
+fn most_repeated(pairs: impl Iterator<Item = (usize, usize)>, value: &[f64]) -> Option<f64> {
+    let mut repeats: Vec<f64> = pairs
+        .filter(|(before, after)| value[*before] == value[*after])
+        .map(|(before, _)| value[before])
+        .collect();
+    repeats.sort_unstable_by(f64::total_cmp);
     repeats
         .chunk_by(|one, other| one == other)
         .max_by_key(|run| run.len())

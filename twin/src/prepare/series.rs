@@ -1,6 +1,6 @@
 //! Rows of drive and observation.
 
-use std::ops::Range;
+use std::{ops::Range, sync::Arc};
 
 use super::Frame;
 use crate::problem::{Drive, Observed};
@@ -18,7 +18,7 @@ pub(super) struct DriveParts {
     /// Time, reference and segments; no environment yet.
     pub drive: Drive,
     /// Row of the frame that each row is from.
-    pub rows: Vec<usize>,
+    pub rows: Arc<Vec<usize>>,
     /// Clock of each segment, as an index into [`Frame::clocks`].
     pub clocks: Vec<usize>,
 }
@@ -26,57 +26,56 @@ pub(super) struct DriveParts {
 /// The rows that have a reference, in segments.
 pub(super) fn drive(frame: &Frame, reference: &[f64]) -> DriveParts {
     let time_s = frame.t_s();
-    let mut parts = DriveParts {
-        drive: Drive::default(),
-        rows: Vec::new(),
-        clocks: Vec::new(),
-    };
+    let mut drive = Drive::default();
+    let mut clocks = Vec::new();
+    let mut known: Vec<usize> = Vec::with_capacity(reference.len());
+    let mut t_s: Vec<f64> = Vec::with_capacity(reference.len());
     for (clock, rows) in frame.clocks().iter().enumerate() {
-        let known: Vec<usize> = rows
-            .clone()
-            .filter(|row| reference[*row].is_finite())
-            .collect();
-        let t_s: Vec<f64> = known.iter().map(|row| time_s[*row]).collect();
-        let first = parts.rows.len();
+        let first = known.len();
+        known.extend(rows.clone().filter(|row| reference[*row].is_finite()));
+        t_s.extend(known[first..].iter().map(|row| time_s[*row]));
         let mut start = first;
         let mut continues = false;
-        for cut in gaps(&t_s).into_iter().chain([known.len()]) {
+        for cut in gaps(&t_s[first..]).into_iter().chain([t_s.len() - first]) {
             let end = first + cut;
             if end > start {
-                parts.drive.segments.push(start..end);
-                parts.drive.continues.push(continues);
-                parts.clocks.push(clock);
+                drive.segments.push(start..end);
+                drive.continues.push(continues);
+                clocks.push(clock);
                 continues = true;
             }
             start = end;
         }
-        parts
-            .drive
-            .reference
-            .extend(known.iter().map(|row| reference[*row]));
-        parts.drive.t_s.extend(t_s);
-        parts.rows.extend(known);
     }
-    parts
+    drive.reference = known.iter().map(|row| reference[*row]).collect();
+    drive.t_s = t_s.into();
+    DriveParts {
+        drive,
+        rows: Arc::new(known),
+        clocks,
+    }
 }
 
 /// Rows before which there is a gap.
 fn gaps(t_s: &[f64]) -> Vec<usize> {
-    let steps: Vec<f64> = t_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
-    let mut sorted: Vec<f64> = steps.iter().copied().filter(|step| *step > 0.0).collect();
-    if sorted.is_empty() {
+    let step = |index: usize| t_s[index + 1] - t_s[index];
+    let steps = t_s.len().saturating_sub(1);
+    let mut positive: Vec<f64> = (0..steps).map(step).filter(|step| *step > 0.0).collect();
+    let Some(median) = median(&mut positive) else {
         return Vec::new();
-    }
-    let middle = sorted.len() / 2;
-    let median = *sorted.select_nth_unstable_by(middle, f64::total_cmp).1;
+    };
     let least = (GAP_STEPS * median).max(SHORTEST_GAP_S);
     let is_gap = |index: usize| {
-        let step = steps[index];
-        let before = index.checked_sub(1).map_or(0.0, |before| steps[before]);
-        let after = steps.get(index + 1).copied().unwrap_or(0.0);
-        step > least && step > GAP_OF_NEIGHBOURS * before.max(after)
+        let now = step(index);
+        let before = index.checked_sub(1).map_or(0.0, step);
+        let after = if index + 1 < steps {
+            step(index + 1)
+        } else {
+            0.0
+        };
+        now > least && now > GAP_OF_NEIGHBOURS * before.max(after)
     };
-    (0..steps.len())
+    (0..steps)
         .filter(|index| is_gap(*index))
         .map(|index| index + 1)
         .collect()
@@ -91,10 +90,10 @@ pub(super) fn share_rows(rows: &[usize], value: &[f64]) -> bool {
 /// An observation on the drive's own rows.
 pub(super) fn drive_rows(
     drive: &Drive,
-    rows: &[usize],
+    rows: &Arc<Vec<usize>>,
     value: &[f64],
     fresh: &[bool],
-) -> (Observed, Vec<usize>) {
+) -> (Observed, Arc<Vec<usize>>) {
     let taken: Vec<f64> = rows.iter().map(|row| value[*row]).collect();
     let observed = Observed {
         t_s: drive.t_s.clone(),
@@ -107,25 +106,24 @@ pub(super) fn drive_rows(
         segment: segments_of(drive),
         on_drive_rows: true,
     };
-    (observed, rows.to_vec())
+    (observed, Arc::clone(rows))
 }
 
 /// The rows of the drive, with nothing observed.
-pub(super) fn every_row(drive: &Drive, rows: &[usize]) -> (Observed, Vec<usize>) {
-    let observed = Observed {
+pub(super) fn every_row(drive: &Drive) -> Observed {
+    Observed {
         t_s: drive.t_s.clone(),
         value: vec![f64::NAN; drive.len()],
         valid: vec![true; drive.len()],
         segment: segments_of(drive),
         on_drive_rows: true,
-    };
-    (observed, rows.to_vec())
+    }
 }
 
-fn segments_of(drive: &Drive) -> Vec<usize> {
+fn segments_of(drive: &Drive) -> Vec<u32> {
     let mut segments = vec![0; drive.len()];
     for (index, rows) in drive.segments.iter().enumerate() {
-        segments[rows.clone()].fill(index);
+        segments[rows.clone()].fill(index as u32);
     }
     segments
 }
@@ -139,9 +137,9 @@ pub(super) fn own_rows(
     t_s: &[f64],
     value: &[f64],
     fresh: &[bool],
-) -> (Observed, Vec<usize>) {
+) -> (Observed, Arc<Vec<usize>>) {
     let mut observed = Observed::default();
-    let mut rows = Vec::new();
+    let (mut rows, mut times_s) = (Vec::new(), Vec::new());
     for (clock, own) in sensor_clocks.iter().enumerate() {
         let segments: Vec<usize> = (0..clocks.len())
             .filter(|index| clocks[*index] == clock)
@@ -158,14 +156,15 @@ pub(super) fn own_rows(
             }
             let inside = &drive.segments[segments[at]];
             let covered = drive.t_s[inside.start] <= now_s && now_s <= drive.t_s[inside.end - 1];
-            observed.t_s.push(now_s);
+            times_s.push(now_s);
             observed.value.push(value[row]);
             observed.valid.push(covered && fresh[row]);
-            observed.segment.push(segments[at]);
+            observed.segment.push(segments[at] as u32);
             rows.push(row);
         }
     }
-    (observed, rows)
+    observed.t_s = times_s.into();
+    (observed, Arc::new(rows))
 }
 
 /// Median time between readings that count, in s; 0 with fewer than two.
@@ -173,7 +172,7 @@ pub(super) fn spacing_s(observed: &Observed) -> f64 {
     let mut last: Option<(usize, f64)> = None;
     let mut steps = Vec::new();
     for row in (0..observed.t_s.len()).filter(|row| observed.valid[*row]) {
-        let (segment, now_s) = (observed.segment[row], observed.t_s[row]);
+        let (segment, now_s) = (observed.segment_of(row), observed.t_s[row]);
         if let Some((before, before_s)) = last
             && before == segment
             && now_s > before_s

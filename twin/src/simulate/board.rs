@@ -244,9 +244,9 @@ impl Board {
         let mut row = 0;
         let mut counted_before_c = 0.0;
         while row < rows {
-            let segment = observed.segment[row];
+            let segment = observed.segment_of(row);
             let end = (row..rows)
-                .find(|next| observed.segment[*next] != segment)
+                .find(|next| observed.segment_of(*next) != segment)
                 .unwrap_or(rows);
             if let Some(inside) = drive
                 .segments

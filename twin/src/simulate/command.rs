@@ -171,7 +171,7 @@ fn integral_c(problem: &Problem, current_a: &[f64]) -> Vec<f64> {
     let mut sum = 0.0;
     (0..current_a.len())
         .map(|row| {
-            if row > 0 && observed.segment[row] == observed.segment[row - 1] {
+            if row > 0 && observed.segment_of(row) == observed.segment_of(row - 1) {
                 let h = observed.t_s[row] - observed.t_s[row - 1];
                 let mean = 0.5 * (current_a[row] + current_a[row - 1]);
                 if mean.is_finite() {
