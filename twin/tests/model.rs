@@ -5,6 +5,7 @@
 use std::{fs, path::Path};
 
 use twin::{
+    effects::chain::Nuisance,
     failure::Failure,
     model::{Found, FrontEndKind, Model, Shift},
 };
@@ -233,6 +234,19 @@ fn an_effect_that_is_there_gets_the_new_values() {
 }
 
 #[test]
+fn what_the_sensor_is_off_by_does_not_hide_what_the_battery_is() {
+    let mut shift = Shift::default();
+    for (alignment_s, soc_shift) in [(0.02, 0.0), (0.0, -0.03), (0.05, 0.01)] {
+        shift.take(Nuisance {
+            alignment_s,
+            soc_shift,
+            ..Nuisance::default()
+        });
+    }
+    assert_eq!((shift.alignment_s, shift.soc), (0.02, -0.03));
+}
+
+#[test]
 fn an_extended_model_in_another_folder_finds_its_table() {
     let folder = tempfile::tempdir().unwrap();
     let models = folder.path().join("models");
@@ -252,7 +266,7 @@ fn an_extended_model_in_another_folder_finds_its_table() {
     let shift = Shift {
         soc: -0.02,
         resistance: 0.5,
-        alignment_s: 0.0,
+        ..Shift::default()
     };
     let extended = model.extended(&[], shift, &models, &out).unwrap();
     assert!(extended.contains("# measured"), "{extended}");

@@ -6,6 +6,7 @@ use std::{fs, path::Path};
 
 use twin::{
     align::{Signal, estimate},
+    effects::scene::Scene,
     failure::Failure,
     model::Model,
     prepare::{Inputs, Prepared, Purpose, prepare},
@@ -82,6 +83,23 @@ fn a_plain_pair_is_taken_as_it_is() {
     assert!(problem.drive.supply_v.is_none());
     assert!(problem.drive.sensor_temperature_c.is_some());
     assert!(remarks.is_empty(), "{remarks:?}");
+}
+
+/// Ten million rows are to fit into 1 GB.
+#[test]
+fn a_column_that_two_share_is_held_once() {
+    let rows = (0..200).map(|k| {
+        let t_s = 0.1 * f64::from(k);
+        vec![t_s, current(t_s), current(t_s)]
+    });
+    let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    assert_eq!(problem.drive.t_s.as_ptr(), problem.observed.t_s.as_ptr());
+    let mut scene = Scene::new(&problem);
+    assert_eq!(problem.drive.reference.as_ptr(), scene.signal.as_ptr());
+    // Until one of them is written to.
+    scene.signal[0] += 1.0;
+    assert_eq!(scene.signal[0], problem.drive.reference[0] + 1.0);
+    assert_eq!(scene.signal[1..], problem.drive.reference[1..]);
 }
 
 #[test]

@@ -21,7 +21,7 @@ pub struct Found {
     pub comment: Vec<String>,
 }
 
-/// What the battery differs by, within what the model file says it does not know.
+/// What the base differs by, within what the model file says it does not know.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Shift {
     /// Added to the initial state of charge, 0 … 1.
@@ -33,14 +33,16 @@ pub struct Shift {
 }
 
 impl Shift {
-    /// What was found for one signal; the first that says something counts.
+    /// What was found for one signal; of each value the first that says something counts.
     pub fn take(&mut self, nuisance: Nuisance) {
-        if *self == Self::default() {
-            *self = Self {
-                soc: nuisance.soc_shift,
-                resistance: nuisance.resistance,
-                alignment_s: nuisance.alignment_s,
-            };
+        for (mine, found) in [
+            (&mut self.soc, nuisance.soc_shift),
+            (&mut self.resistance, nuisance.resistance),
+            (&mut self.alignment_s, nuisance.alignment_s),
+        ] {
+            if *mine == 0.0 {
+                *mine = found;
+            }
         }
     }
 }
