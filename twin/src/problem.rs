@@ -92,6 +92,58 @@ pub struct Drive {
     pub continues: Vec<bool>,
 }
 
+/// The drive's segment that each row of an observation belongs to: rows of one segment follow one another, and only where another
+/// begins is it said.
+#[derive(Clone, Debug, Default)]
+pub struct Stretches {
+    /// The first row of each stretch, and its segment.
+    starts: Vec<(usize, usize)>,
+    rows: usize,
+}
+
+impl Stretches {
+    /// So many rows of the first segment.
+    pub fn one(rows: usize) -> Self {
+        Self {
+            starts: vec![(0, 0)],
+            rows,
+        }
+    }
+
+    /// The next row, with the index of its segment.
+    pub fn push(&mut self, segment: usize) {
+        if self.starts.last().is_none_or(|(_, last)| *last != segment) {
+            self.starts.push((self.rows, segment));
+        }
+        self.rows += 1;
+    }
+
+    /// Index of the segment that a row belongs to.
+    pub fn segment_of(&self, row: usize) -> usize {
+        let after = self.starts.partition_point(|(first, _)| *first <= row);
+        self.starts[after - 1].1
+    }
+
+    /// Each stretch: the index of its segment, and its rows.
+    pub fn iter(&self) -> impl Iterator<Item = (usize, Range<usize>)> + '_ {
+        let ends = self.starts.iter().skip(1).map(|(first, _)| *first);
+        self.starts
+            .iter()
+            .zip(ends.chain([self.rows]))
+            .map(|((first, segment), end)| (*segment, *first..end))
+    }
+}
+
+impl FromIterator<usize> for Stretches {
+    fn from_iter<I: IntoIterator<Item = usize>>(segments: I) -> Self {
+        let mut stretches = Self::default();
+        segments
+            .into_iter()
+            .for_each(|segment| stretches.push(segment));
+        stretches
+    }
+}
+
 /// What was recorded of the signal under test.
 #[derive(Clone, Debug, Default)]
 pub struct Observed {
@@ -101,8 +153,8 @@ pub struct Observed {
     pub value: Vec<f64>,
     /// True where the reading counts: present, not a repeat of a held value, not in a drop-out, within the drive's time.
     pub valid: Vec<bool>,
-    /// Index of the drive's segment that the row belongs to; see [`Observed::segment_of`].
-    pub segment: Vec<u32>,
+    /// The drive's segment that each row belongs to.
+    pub stretches: Stretches,
     /// True if row `k` of the observation is row `k` of the drive (same time stamps): no interpolation then.
     pub on_drive_rows: bool,
 }
@@ -112,7 +164,7 @@ impl Observed {
     pub fn with_drive(t_s: impl Into<Series>, value: Vec<f64>) -> Self {
         Self {
             valid: vec![true; value.len()],
-            segment: vec![0; value.len()],
+            stretches: Stretches::one(value.len()),
             on_drive_rows: true,
             t_s: t_s.into(),
             value,
@@ -277,7 +329,7 @@ impl Drive {
 impl Observed {
     /// Index of the drive's segment that a row belongs to.
     pub fn segment_of(&self, row: usize) -> usize {
-        self.segment[row] as usize
+        self.stretches.segment_of(row)
     }
 
     /// Rows that count.

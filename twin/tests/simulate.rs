@@ -18,7 +18,9 @@ use twin::{
     explain,
     model::{FrontEndKind, Model},
     prepare::{Inputs, Prepared, Purpose, prepare},
-    problem::{Base, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, Series, View},
+    problem::{
+        Base, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, Series, Stretches, View,
+    },
     simulate::{
         board::{Board, Pace},
         command::columns,
@@ -63,7 +65,7 @@ fn observed(t_s: impl Into<Series>) -> Observed {
         t_s,
         value: vec![f64::NAN; rows],
         valid: vec![true; rows],
-        segment: vec![0; rows],
+        stretches: Stretches::one(rows),
         on_drive_rows: false,
     }
 }

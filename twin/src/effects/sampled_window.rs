@@ -1,6 +1,6 @@
 //! Only a part of each period is measured.
 
-use super::scene::{Integrated, Scale, Scene, floored};
+use super::scene::{Cursor, Scale, Scene, floored};
 use crate::spectrum;
 
 use super::{Card, Clues, Effect, Parameter, Search, Stage};
@@ -121,9 +121,7 @@ impl Effect for SampledWindow {
         let mut output = input.to_vec();
         for rows in drive.segments.iter().filter(|rows| !rows.is_empty()) {
             let start = drive.t_s[rows.start] + phase;
-            // Windows go forward: one cursor for where they begin, one for where they end.
-            let mut begin = Integrated::new(&drive.t_s, input, rows.clone(), held);
-            let mut end = begin.clone();
+            let mut cursor = Cursor::new(&drive.t_s, rows.clone());
             let (mut value, mut until) = (input[rows.start], f64::NEG_INFINITY);
             let mut known = f64::NAN;
             for (out, t) in output[rows.clone()]
@@ -139,16 +137,7 @@ impl Effect for SampledWindow {
                     if ended >= 0.0 && ended != known {
                         known = ended;
                         let from = start + ended * period;
-                        let to = from + duty * period;
-                        // The mean over a straight line is its value in the middle: most windows below a row are within one.
-                        let middle = end.value(0.5 * (from + to));
-                        value = if end.in_step(from) && end.in_step(to) {
-                            middle
-                        } else {
-                            let before = begin.integral(from);
-                            let after = end.integral(to);
-                            (after - before) / (duty * period)
-                        };
+                        value = cursor.mean(input, from, from + duty * period, held);
                     }
                 }
                 *out = value;

@@ -394,61 +394,6 @@ pub fn integral(t_s: &[f64], segments: &[Range<usize>], input: &[f64], held: boo
     output
 }
 
-/// The integral of a series at times that go forward, without holding it for every row.
-#[derive(Clone, Debug)]
-pub struct Integrated<'a> {
-    cursor: Cursor<'a>,
-    input: &'a [f64],
-    held: bool,
-    /// Integral from the start of the segment to the cursor's row.
-    sum: f64,
-}
-
-impl<'a> Integrated<'a> {
-    /// Over one segment, as [`integral`].
-    pub fn new(t_s: &'a [f64], input: &'a [f64], rows: Range<usize>, held: bool) -> Self {
-        Self {
-            cursor: Cursor::new(t_s, rows),
-            input,
-            held,
-            sum: 0.0,
-        }
-    }
-
-    fn seek(&mut self, t: f64) {
-        let from = self.cursor.at;
-        self.cursor.seek(t);
-        let to = self.cursor.at;
-        let area = |row| area(self.cursor.t_s, self.input, row, self.held);
-        if to < from {
-            self.sum -= (to..from).map(area).sum::<f64>();
-        } else {
-            // One after the other, as the whole integral is summed.
-            self.sum = (from..to).map(area).fold(self.sum, |sum, area| sum + area);
-        }
-    }
-
-    /// Value at a time, see [`Cursor::value`].
-    #[inline]
-    pub fn value(&mut self, t: f64) -> f64 {
-        self.seek(t);
-        self.cursor.value(self.input, t, self.held)
-    }
-
-    /// Integral at a time, see [`Cursor::integral`].
-    #[inline]
-    pub fn integral(&mut self, t: f64) -> f64 {
-        self.seek(t);
-        self.cursor.beyond(self.sum, self.input, t, self.held)
-    }
-
-    /// See [`Cursor::in_step`].
-    #[inline]
-    pub fn in_step(&self, t: f64) -> bool {
-        self.cursor.in_step(t)
-    }
-}
-
 /// A place to look values up between rows, for times that mostly go forward.
 #[derive(Clone, Debug)]
 pub struct Cursor<'a> {
@@ -495,27 +440,37 @@ impl<'a> Cursor<'a> {
     #[inline]
     pub fn integral(&mut self, integral: &[f64], series: &[f64], t: f64, held: bool) -> f64 {
         self.seek(t);
-        self.beyond(integral[self.at], series, t, held)
+        integral[self.at] + self.beyond(series, t, held)
     }
 
-    /// The integral at a time from what it is at the row where the cursor stands.
+    /// Mean from one time to a later one. The cursor ends where that ends: over times that go forward every row is passed once.
     #[inline]
-    fn beyond(&self, integral: f64, series: &[f64], t: f64, held: bool) -> f64 {
+    pub fn mean(&mut self, series: &[f64], from: f64, to: f64, held: bool) -> f64 {
+        self.seek(from);
+        let at = self.at;
+        if from >= self.t_s[at] && at + 1 < self.rows.end && to <= self.t_s[at + 1] {
+            // Of a straight line it is the value in the middle.
+            return self.value(series, 0.5 * (from + to), held);
+        }
+        let mut sum = -self.beyond(series, from, held);
+        while self.at + 1 < self.rows.end && self.t_s[self.at + 1] <= to {
+            sum += area(self.t_s, series, self.at, held);
+            self.at += 1;
+        }
+        (sum + self.beyond(series, to, held)) / (to - from)
+    }
+
+    /// Integral from the row where the cursor stands to a time before the next one, or beyond the ends.
+    #[inline]
+    fn beyond(&self, series: &[f64], t: f64, held: bool) -> f64 {
         let at = self.at;
         let h = t - self.t_s[at];
-        // Before the first row, behind the last one.
         if h <= 0.0 || at + 1 >= self.rows.end || held {
-            return integral + series[at] * h;
+            return series[at] * h;
         }
         let step = self.t_s[at + 1] - self.t_s[at];
         let end = series[at] + (series[at + 1] - series[at]) * (h / step);
-        integral + 0.5 * (series[at] + end) * h
-    }
-
-    /// Whether a time is in the step that begins at the row where the cursor stands.
-    #[inline]
-    pub fn in_step(&self, t: f64) -> bool {
-        t >= self.t_s[self.at] && self.at + 1 < self.rows.end && t <= self.t_s[self.at + 1]
+        0.5 * (series[at] + end) * h
     }
 }
 
@@ -655,13 +610,9 @@ impl<'a> Scene<'a> {
             .then(|| integral(&drive.t_s, &drive.segments, &self.signal, held));
         let mut sampled = vec![f64::NAN; observed.t_s.len()];
         let (skew, delay_s) = (1.0 + self.skew, self.delay_s);
-        let mut from = 0;
         let mut known: (usize, Option<(f64, f64)>) = (usize::MAX, None);
         // One stretch of readings after the other, each within one segment.
-        for readings in observed.segment.chunk_by(|a, b| a == b) {
-            let these = from..from + readings.len();
-            from = these.end;
-            let segment = readings[0] as usize;
+        for (segment, these) in observed.stretches.iter() {
             let rows = drive.segments.get(segment).cloned();
             let Some(rows) = rows.filter(|rows| !rows.is_empty()) else {
                 continue;
@@ -862,6 +813,32 @@ mod tests {
         let t_s: Vec<f64> = (0..2000).map(|k| f64::from(k) * 0.01).collect();
         let output = boxcar(&t_s, &[0..2000], &t_s, 0.333, false);
         assert!((output[1999] - (t_s[1999] - 0.1665)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_mean_is_the_integral_over_its_time() {
+        // Uneven rows, two at one time.
+        let t_s: Vec<f64> = (0..60)
+            .map(|k| 0.1 * f64::from(k - k % 7 / 6) + 0.03 * f64::from(k % 3 % 2))
+            .collect();
+        let series: Vec<f64> = t_s.iter().map(|t| (3.0 * t).sin() + t).collect();
+        for held in [false, true] {
+            let total = integral(&t_s, &[0..60], &series, held);
+            for (period, length) in [(0.07, 0.001), (0.05, 0.05), (0.31, 0.2), (2.0, 2.0)] {
+                let mut mean = Cursor::new(&t_s, 0..60);
+                let mut from = -0.4;
+                while from < 6.4 {
+                    let until = |t| Cursor::new(&t_s, 0..60).integral(&total, &series, t, held);
+                    let expected = (until(from + length) - until(from)) / length;
+                    let found = mean.mean(&series, from, from + length, held);
+                    assert!(
+                        (found - expected).abs() < 1e-9,
+                        "{held} {length} {from}: {found} {expected}"
+                    );
+                    from += period;
+                }
+            }
+        }
     }
 
     #[test]

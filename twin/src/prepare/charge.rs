@@ -183,7 +183,7 @@ fn differences(
         times_s.push(now_s);
         observed.value.push(mean);
         observed.valid.push(mean.is_finite());
-        observed.segment.push((segment + shift) as u32);
+        observed.stretches.push(segment + shift);
         kept.push(*row);
     }
     observed.t_s = times_s.into();

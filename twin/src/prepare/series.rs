@@ -3,7 +3,7 @@
 use std::{ops::Range, sync::Arc};
 
 use super::Frame;
-use crate::problem::{Drive, Observed};
+use crate::problem::{Drive, Observed, Stretches};
 
 /// A step is a gap if it is longer than this many median steps, …
 const GAP_STEPS: f64 = 10.0;
@@ -103,7 +103,7 @@ pub(super) fn drive_rows(
             .map(|(row, value)| value.is_finite() && fresh[*row])
             .collect(),
         value: taken,
-        segment: segments_of(drive),
+        stretches: stretches(drive),
         on_drive_rows: true,
     };
     (observed, Arc::clone(rows))
@@ -115,17 +115,17 @@ pub(super) fn every_row(drive: &Drive) -> Observed {
         t_s: drive.t_s.clone(),
         value: vec![f64::NAN; drive.len()],
         valid: vec![true; drive.len()],
-        segment: segments_of(drive),
+        stretches: stretches(drive),
         on_drive_rows: true,
     }
 }
 
-fn segments_of(drive: &Drive) -> Vec<u32> {
-    let mut segments = vec![0; drive.len()];
-    for (index, rows) in drive.segments.iter().enumerate() {
-        segments[rows.clone()].fill(index as u32);
-    }
+/// The segments of the drive's own rows.
+fn stretches(drive: &Drive) -> Stretches {
+    let segments = drive.segments.iter().enumerate();
     segments
+        .flat_map(|(index, rows)| rows.clone().map(move |_| index))
+        .collect()
 }
 
 /// An observation on rows of its own: those that have a reading. `sensor_clocks` are the sensor's clocks, each the same
@@ -159,7 +159,7 @@ pub(super) fn own_rows(
             times_s.push(now_s);
             observed.value.push(value[row]);
             observed.valid.push(covered && fresh[row]);
-            observed.segment.push(segments[at] as u32);
+            observed.stretches.push(segments[at]);
             rows.push(row);
         }
     }
