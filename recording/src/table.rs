@@ -177,17 +177,25 @@ impl Table {
         Error::new(kind, self.source.as_str(), place, found, expected)
     }
 
-    /// The columns under the names that `mapping` gives them; those it does not speak of keep theirs.
+    /// The columns under the names that `mapping` gives them, a minus before one turning its sign; those it does not speak of keep
+    /// theirs.
     pub fn mapped(mut self, mapping: &Mapping) -> Result<Self> {
         let mut columns = Vec::new();
         let mut taken = HashSet::new();
         for (name, from) in mapping.pairs() {
-            let column = self.find(from).ok_or_else(|| self.lacks(from))?;
-            taken.insert(from);
-            columns.push(Column {
+            // A column's own name may begin with a minus.
+            let as_it_is = self.find(from);
+            let turned = || self.find(from.strip_prefix('-')?);
+            let column = as_it_is.or_else(turned).ok_or_else(|| self.lacks(from))?;
+            let mut mapped = Column {
                 name: name.to_owned(),
                 ..column.clone()
-            });
+            };
+            if as_it_is.is_none() {
+                mapped.values.iter_mut().for_each(|value| *value = -*value);
+            }
+            taken.insert(column.name.clone());
+            columns.push(mapped);
         }
         let named: HashSet<&str> = mapping.pairs().map(|(name, _)| name).collect();
         columns.extend(

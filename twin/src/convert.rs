@@ -33,8 +33,8 @@ pub struct Arguments {
     /// The recording to write; its ending says the format: .csv or .parquet.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Calls a column, or a signal Message.Signal, by another name.
-    #[arg(long, value_name = "NAME=COLUMN")]
+    /// Calls a column, or a signal Message.Signal, by another name; a minus before it turns its sign.
+    #[arg(long, value_name = "NAME=COLUMN", allow_hyphen_values = true)]
     map: Vec<String>,
     /// The bus to take where a log has several: an interface such as can0, or a channel such as 1.
     #[arg(long, value_name = "NAME")]

@@ -236,7 +236,7 @@ impl<'a> Work<'a> {
                 seconds(interval_s)
             ));
         }
-        self.find_clock(&found, value.as_deref(), &fresh, &measured)?;
+        self.find_clock(&found, value, &fresh, &measured)?;
         let parts = series::drive(self.drive_frame(), &found);
         let mut drive = parts.drive;
         self.surroundings(&mut drive, &parts.rows);

@@ -57,7 +57,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
     let every = Freshness::all(work.frame.t_s().len());
     if work.reference.is_some() && work.clock.is_none() {
         let sensed = CURRENTS.iter().find_map(|name| work.frame.column(name));
-        work.find_clock(&found, sensed.as_deref(), &every, "i_meas_a")?;
+        work.find_clock(&found, sensed, &every, "i_meas_a")?;
     }
     let parts = series::drive(work.drive_frame(), &found);
     let mut drive = parts.drive;

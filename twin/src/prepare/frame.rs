@@ -1,6 +1,6 @@
 //! A recording under the names of the model file, with its signs.
 
-use std::{borrow::Cow, collections::HashSet, fs::File, io::Read, ops::Range, path::Path};
+use std::{fs::File, io::Read, ops::Range, path::Path};
 
 use recording::{Error, Mapping, Recording, Table, convert::Format, csv, parquet};
 
@@ -11,17 +11,12 @@ use crate::{failure::Failure, model::Model};
 #[derive(Clone, Debug)]
 pub struct Frame {
     recording: Recording,
-    /// Names whose sign is turned.
-    negated: HashSet<String>,
 }
 
 impl Frame {
     /// A recording as it is.
     pub fn new(recording: Recording) -> Self {
-        Self {
-            recording,
-            negated: HashSet::new(),
-        }
+        Self { recording }
     }
 
     /// The file's name.
@@ -40,19 +35,13 @@ impl Frame {
     }
 
     /// A column, NaN where a value is missing.
-    pub fn column(&self, name: &str) -> Option<Cow<'_, [f64]>> {
-        let values = self.recording.column(name)?;
-        Some(if self.negated.contains(name) {
-            values.iter().map(|value| -value).collect()
-        } else {
-            values.into()
-        })
+    pub fn column(&self, name: &str) -> Option<&[f64]> {
+        self.recording.column(name)
     }
 
     /// A column that must be there.
-    pub fn need(&self, name: &str) -> Result<Cow<'_, [f64]>, Failure> {
-        self.recording.need(name)?;
-        Ok(self.column(name).unwrap_or_default())
+    pub fn need(&self, name: &str) -> Result<&[f64], Failure> {
+        Ok(self.recording.need(name)?)
     }
 
     /// Time of each row in s.
@@ -124,19 +113,8 @@ fn table(path: &Path) -> Result<Table, Failure> {
 
 fn mapped(table: Table, wanted: &[(String, String)]) -> Result<Frame, Failure> {
     let mut mapping = Mapping::new();
-    let mut negated = HashSet::new();
     for (name, column) in wanted {
-        // A column's own name may begin with a minus.
-        let turned = column
-            .strip_prefix('-')
-            .filter(|_| table.column(column).is_none());
-        if turned.is_some() {
-            negated.insert(name.clone());
-        }
-        mapping.add(name, turned.unwrap_or(column))?;
+        mapping.add(name, column)?;
     }
-    Ok(Frame {
-        recording: table.mapped(&mapping)?.into_recording()?,
-        negated,
-    })
+    Ok(Frame::new(table.mapped(&mapping)?.into_recording()?))
 }
