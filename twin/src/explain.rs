@@ -19,7 +19,7 @@ use std::time::Instant;
 
 use crate::effects::chain::{Chain, Nuisance};
 use crate::effects::scene::Scale;
-use crate::effects::{Effect, IDEALISED, Search, Stage, find, find_with};
+use crate::effects::{Effect, IDEALISED, Search, find, find_with};
 use crate::problem::{Base, Coloured, Problem};
 use crate::report::data::{
     EffectReport, FittedModel, HoldoutReport, Location, ParameterReport, Report, SignalPlots,
@@ -639,12 +639,8 @@ fn quantile(series: &[f64], share: f64) -> f64 {
 fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
     let count = bench.len() as f64;
     let noise = bench.problem.noise;
-    let ends = fit
-        .model
-        .members
-        .iter()
-        .any(|member| member.effect.card().stage == Stage::Output);
-    if noise > 0.0 && ends {
+    let cuts = fit.model.members.iter().any(|member| member.effect.cuts());
+    if noise > 0.0 && cuts {
         let energy = bench.noise_energy(&fit.model, &fit.predicted, noise, seed);
         energy.max(noise * noise * count)
     } else if noise > 0.0 {
@@ -713,7 +709,7 @@ fn judge(
             selection.decisions.push(format!(
                 "No effect passes, yet a smooth function of the recorded inputs takes {} of the held-out error (placebos up to {}): unknown.",
                 percent(before.share),
-                percent(before.placebo_p99)
+                percent(before.placebo_most)
             ));
             Verdict::Unknown
         } else if let Some(strays) = strays(bench, residual) {
@@ -768,7 +764,7 @@ fn judge(
         selection.decisions.push(format!(
             "Structure is left: a smooth function of the recorded inputs would take {} of what remains (placebos up to {}), {} of what the named effects take.",
             percent(left.share),
-            percent(left.placebo_p99),
+            percent(left.placebo_most),
             percent(smooth / explained.max(1e-300))
         ));
     }

@@ -9,7 +9,7 @@ pub struct Line {
     pub frequency_hz: f64,
     /// Amplitude of the sine.
     pub amplitude: f64,
-    /// Phase of the sine at t = 0.
+    /// Phase of the sine at the first of the times.
     pub phase_rad: f64,
 }
 
@@ -117,13 +117,14 @@ pub fn lines(t_s: &[f64], values: &[f64], step_s: f64) -> Vec<Line> {
             let frequency_hz = (at as f64 + shift) / (length as f64 * step_s);
             let turn = frequency_hz * std::f64::consts::TAU;
             let (mut sine, mut cosine) = (0.0, 0.0);
+            let begin_s = t_s.first().copied().unwrap_or_default();
             for (t, value) in t_s
                 .iter()
                 .zip(values)
                 .filter(|(_, value)| value.is_finite())
             {
-                sine += value * (turn * t).sin();
-                cosine += value * (turn * t).cos();
+                sine += value * (turn * (t - begin_s)).sin();
+                cosine += value * (turn * (t - begin_s)).cos();
             }
             let share = 2.0 / filled.max(1) as f64;
             Line {

@@ -11,7 +11,7 @@ pub struct Hum;
 static CARD: Card = Card {
     id: "hum",
     statement: "A ripple at the mains or inverter frequency is added, perhaps folded down by the sampling rate.",
-    equation: "y = i + amplitude·sin(2π·frequency·t + φ), φ is fitted beside",
+    equation: "y = i + amplitude·sin(2π·frequency·t + φ), t from the first row on, φ is fitted beside",
     parameters: &[
         Parameter::new("frequency_hz", "Hz", 1.0, Search::Smooth),
         Parameter::new("amplitude_a", "A", 0.0, Search::Linear),
@@ -43,9 +43,14 @@ impl Effect for Hum {
             .zip(clues.predicted)
             .map(|(y, p)| y - p)
             .collect();
+        let late_s = clues.t_s.first().map_or(0.0, |first| first - scale.begin_s);
         spectrum::lines(clues.t_s, &residual, scale.reading_step_s)
             .into_iter()
-            .map(|line| vec![line.frequency_hz, line.amplitude, line.phase_rad])
+            .map(|line| {
+                let turns = line.frequency_hz * std::f64::consts::TAU;
+                let phase = (line.phase_rad - turns * late_s) % std::f64::consts::TAU;
+                vec![line.frequency_hz, line.amplitude, phase]
+            })
             .collect()
     }
 
@@ -53,8 +58,10 @@ impl Effect for Hum {
         let (turns_hz, amplitude, phase) =
             (values[0] * std::f64::consts::TAU, values[1], values[2]);
         let t_s = &scene.observed.t_s;
+        // A clock may count from 1970: frequency and phase are told apart only where time counts from the recording.
+        let begin_s = t_s.first().copied().unwrap_or_default();
         for (value, t) in scene.signal.iter_mut().zip(t_s) {
-            *value += amplitude * (turns_hz * t + phase).sin();
+            *value += amplitude * (turns_hz * (t - begin_s) + phase).sin();
         }
     }
 }

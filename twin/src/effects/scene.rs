@@ -33,6 +33,8 @@ pub struct Scale {
     pub reading_step_s: f64,
     /// The same as a whole part of the time covered, in s: where steps are even, it keeps in step over the recording.
     pub even_s: f64,
+    /// Time of the first observed row in s.
+    pub begin_s: f64,
     /// Time covered in s; of the longest segment.
     pub span_s: f64,
     /// Capacity of the battery in Ah, 0 without one.

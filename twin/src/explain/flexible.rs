@@ -23,14 +23,14 @@ const RIDGE: f64 = 1e-3;
 pub struct Explainable {
     /// Share of the squared residual on held-out blocks, 0 … 1.
     pub share: f64,
-    /// 99th percentile of placebos' shares.
-    pub placebo_p99: f64,
+    /// The largest of the placebos' shares.
+    pub placebo_most: f64,
 }
 
 impl Explainable {
     /// More than chance.
     pub fn is_real(&self) -> bool {
-        self.share > self.placebo_p99 && self.share > 0.0
+        self.share > self.placebo_most && self.share > 0.0
     }
 }
 
@@ -181,7 +181,7 @@ impl Features {
             .collect();
         Explainable {
             share: shares[0].max(0.0),
-            placebo_p99: shares[1..]
+            placebo_most: shares[1..]
                 .iter()
                 .fold(0.0, |most, share| f64::max(most, *share)),
         }

@@ -52,6 +52,9 @@ const CHANCE: f64 = 1e-3;
 /// An effect would do as well as another if it takes at least this share of what that one takes.
 const EQUAL: f64 = 0.5;
 
+/// Rounds of adding, doing without and exchanging.
+const ROUNDS: usize = 3;
+
 /// A named effect and what speaks for it.
 #[derive(Clone, Debug)]
 pub struct Named {
@@ -59,7 +62,7 @@ pub struct Named {
     pub index: usize,
     /// Share of the held-out loss that goes when it is added last.
     pub held_out_gain: f64,
-    /// 99th percentile of placebos for the same step.
+    /// 99th percentile of placebos for that step.
     pub placebo_p99: f64,
     /// Effects that would have done as well in its place.
     pub equivalent: Vec<&'static str>,
@@ -80,6 +83,8 @@ pub struct Selection {
     pub decisions: Vec<String>,
     /// Candidates that could not be accepted though they were the best at their step, and why not.
     pub refused: Vec<String>,
+    /// Of whatever is random.
+    seed: u64,
 }
 
 impl Selection {
@@ -94,14 +99,8 @@ impl Selection {
 
     /// Asks anew what speaks for each effect, after the model was changed.
     pub fn rename(&mut self, bench: &Workbench<'_>) {
-        let p99: Vec<(&'static str, f64)> = self
-            .named
-            .iter()
-            .zip(&self.ids)
-            .map(|(named, id)| (*id, named.placebo_p99))
-            .collect();
         let others = swapped(bench, &self.fit);
-        self.named = name(bench, &self.fit, &others, &p99);
+        self.named = name(bench, &self.fit, &others, self.seed);
         self.ids = self.fit.model.ids();
     }
 }
@@ -137,7 +136,6 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
     let mut now = plain.clone();
     let mut decisions = Vec::new();
     let mut refused = Vec::new();
-    let mut step_p99: Vec<(&'static str, f64)> = Vec::new();
     let mut rounds = 0;
     let (now, named) = loop {
         while now.model.members.len() < MOST_EFFECTS {
@@ -155,21 +153,16 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                     bench,
                     &now,
                     &screening,
-                    single.as_ref().map(|(fit, _)| fit),
+                    single.as_ref(),
                     &mut decisions,
                     &mut refused,
                 )
             } else {
                 None
             };
-            let Some((better, p99)) = double.or(single) else {
+            let Some(better) = double.or(single) else {
                 break;
             };
-            for id in better.model.ids() {
-                if !step_p99.iter().any(|(known, _)| *known == id) {
-                    step_p99.push((id, p99));
-                }
-            }
             now = better;
         }
         rounds += 1;
@@ -177,23 +170,24 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
             0.85,
             "trying to do without each effect, and with others in its place",
         );
-        if let Some(leaner) = backward(bench, &now, &step_p99, &mut decisions) {
+        if let Some(leaner) = backward(bench, &now, seed, &mut decisions) {
             now = leaner;
         }
         let others = swapped(bench, &now);
-        match swap(bench, &now, &others, &mut decisions) {
+        let better = (rounds < ROUNDS).then(|| swap(bench, &now, &others, &mut decisions));
+        match better.flatten() {
             // A better model may have room for another effect.
-            Some(better) if rounds < 3 => now = better,
-            _ => {
+            Some(better) => now = better,
+            None => {
                 progress(0.92, "asking which other effects would do as well");
                 let mut now = polish(bench, &now);
                 let mut others = others;
                 // The last exchange may have made another one needless.
-                if let Some(leaner) = backward(bench, &now, &step_p99, &mut decisions) {
+                if let Some(leaner) = backward(bench, &now, seed, &mut decisions) {
                     now = polish(bench, &leaner);
                     others = swapped(bench, &now);
                 }
-                let mut named = name(bench, &now, &others, &step_p99);
+                let mut named = name(bench, &now, &others, seed);
                 // Of equals the plainest is named.
                 for _ in 0..now.model.members.len() {
                     let Some(plainer) = plainer(bench, &now, &others, &named) else {
@@ -205,11 +199,11 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                     ));
                     now = polish(bench, &plainer);
                     // What only made up for the other equation goes with it.
-                    if let Some(leaner) = backward(bench, &now, &step_p99, &mut decisions) {
+                    if let Some(leaner) = backward(bench, &now, seed, &mut decisions) {
                         now = polish(bench, &leaner);
                     }
                     others = swapped(bench, &now);
-                    named = name(bench, &now, &others, &step_p99);
+                    named = name(bench, &now, &others, seed);
                 }
                 // Small, and as well explained by many others: that is structure, and no name.
                 let Some(vague) = named.iter().find(|one| {
@@ -229,7 +223,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                 ));
                 let now = fit(bench, &now.model.without(vague.index), None);
                 let others = swapped(bench, &now);
-                let named = name(bench, &now, &others, &step_p99);
+                let named = name(bench, &now, &others, seed);
                 break (now, named);
             }
         }
@@ -242,6 +236,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
         named,
         decisions,
         refused,
+        seed,
     }
 }
 
@@ -374,7 +369,7 @@ fn step(
     screening: &Screening,
     decisions: &mut Vec<String>,
     refused: &mut Vec<String>,
-) -> Option<(Fit, f64)> {
+) -> Option<Fit> {
     let models = promising(bench, now, &screening.entries, FITTED, STARTS);
     let fits = fits(bench, models);
     let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
@@ -420,7 +415,7 @@ fn step(
                     DRAWS,
                     percent(screening.placebo_p99)
                 ));
-                return Some((better, screening.placebo_p99));
+                return Some(better);
             }
         }
     }
@@ -630,7 +625,7 @@ fn pair(
     single: Option<&Fit>,
     decisions: &mut Vec<String>,
     refused: &mut Vec<String>,
-) -> Option<(Fit, f64)> {
+) -> Option<Fit> {
     // What one effect explains so well needs no second one to be found.
     if single.is_some_and(|single| share(bench, now, single) > CLEAR) {
         return None;
@@ -688,7 +683,7 @@ fn pair(
         ids[count - 1],
         percent(share(bench, now, &best))
     ));
-    Some((best, screening.placebo_p99))
+    Some(best)
 }
 
 /// Share of the held-out error that two effects have to take together: each may gain what a placebo gains.
@@ -736,18 +731,19 @@ fn unfit(
     })
 }
 
-fn p99_of(step_p99: &[(&'static str, f64)], id: &str) -> f64 {
-    step_p99
-        .iter()
-        .find(|(known, _)| *known == id)
-        .map_or(0.0, |(_, p99)| *p99)
+/// What placebos gain of what a model leaves: the least that an effect has to take to be added to it.
+fn limit(bench: &Workbench<'_>, without: &Fit, seed: u64) -> f64 {
+    bench.limit(&without.model, || {
+        let seed = seed.wrapping_add(without.model.members.len() as u64);
+        screen(bench, without, seed, DRAWS).placebo_p99
+    })
 }
 
 /// Leaves out what is no longer missed.
 fn backward(
     bench: &Workbench<'_>,
     now: &Fit,
-    step_p99: &[(&'static str, f64)],
+    seed: u64,
     decisions: &mut Vec<String>,
 ) -> Option<Fit> {
     let mut leaner: Option<Fit> = None;
@@ -756,32 +752,30 @@ fn backward(
         if here.model.members.len() < 2 {
             return leaner;
         }
-        let tried: Vec<(usize, Fit, f64)> = (0..here.model.members.len())
+        // Each has to be missed, with the others there; of those that are not, the least goes first.
+        let tried: Vec<(usize, Fit, f64, String)> = (0..here.model.members.len())
             .into_par_iter()
-            .map(|index| {
+            .filter_map(|index| {
                 let without = fit(bench, &here.model.without(index), None);
                 let missed = share(bench, &without, here);
-                (index, without, missed)
+                let placebos = limit(bench, &without, seed);
+                let why = if missed <= placebos {
+                    format!(
+                        "takes only {} of the held-out error, placebos up to {}",
+                        percent(missed),
+                        percent(placebos)
+                    )
+                } else {
+                    obstacle(bench, &without, here, index, missed)?
+                };
+                Some((index, without, missed, why))
             })
             .collect();
         let least = tried.into_iter().min_by(|a, b| a.2.total_cmp(&b.2));
-        let Some((index, without, missed)) = least else {
+        let Some((index, without, _, why)) = least else {
             return leaner;
         };
         let id = here.model.members[index].id();
-        let placebos = p99_of(step_p99, id);
-        let why = if missed <= placebos {
-            Some(format!(
-                "takes only {} of the held-out error, placebos up to {}",
-                percent(missed),
-                percent(placebos)
-            ))
-        } else {
-            obstacle(bench, &without, here, index, missed)
-        };
-        let Some(why) = why else {
-            return leaner;
-        };
         decisions.push(format!(
             "{id} taken out again, with the others there: {why}."
         ));
@@ -922,19 +916,14 @@ fn plainer(
 }
 
 /// What speaks for each effect, and what would have done as well.
-fn name(
-    bench: &Workbench<'_>,
-    now: &Fit,
-    others: &[(usize, Fit)],
-    step_p99: &[(&'static str, f64)],
-) -> Vec<Named> {
+fn name(bench: &Workbench<'_>, now: &Fit, others: &[(usize, Fit)], seed: u64) -> Vec<Named> {
     (0..now.model.members.len())
         .map(|index| {
-            let id = now.model.members[index].id();
             let without = fit(bench, &now.model.without(index), None);
             let taken = share(bench, &without, now);
+            let placebo_p99 = limit(bench, &without, seed);
             // Where few rows decide, the difference of two models is never certain: who takes much less is no equal.
-            let least = (EQUAL * taken).max(p99_of(step_p99, id));
+            let least = (EQUAL * taken).max(placebo_p99);
             let beside = beside(bench, now, index);
             let mut equivalent: Vec<&'static str> = others
                 .iter()
@@ -954,7 +943,7 @@ fn name(
             Named {
                 index,
                 held_out_gain: taken,
-                placebo_p99: p99_of(step_p99, id),
+                placebo_p99,
                 equivalent,
             }
         })
@@ -1000,7 +989,8 @@ fn only_aligns(bench: &Workbench<'_>, before: &Fit, after: &Fit, index: usize) -
 
 /// A share in percent, short.
 pub fn percent(share: f64) -> String {
-    if share.is_finite() {
+    // What is next to nothing is no measure.
+    if share.abs() < 1e4 {
         format!("{:.3} %", 100.0 * share).replace(".000 %", " %")
     } else {
         "more than any".into()

@@ -116,7 +116,7 @@ fn misfit(
     let mut free = hats.to_vec();
     clean(&mut free, own);
     let missed = Features::of(bench, &free).explain(&fit.residual, seed);
-    if missed.share <= CERTAIN * missed.placebo_p99 {
+    if missed.share <= CERTAIN * missed.placebo_most {
         return None;
     }
     let left = missed.share * dot(&fit.residual, &fit.residual);

@@ -112,6 +112,8 @@ pub struct Workbench<'a> {
     pub modelled: f64,
     /// Fits that were made: from which model to which, with spread and loss.
     known: Mutex<HashMap<Key, (Model, f64, f64)>>,
+    /// What placebos gain of what models leave.
+    limits: Mutex<HashMap<Key, f64>>,
     /// Makes the stated noise white, with the readings after it.
     white: Option<(Whitening, Vec<f64>)>,
 }
@@ -207,6 +209,7 @@ impl<'a> Workbench<'a> {
             blocks,
             library,
             known: Mutex::default(),
+            limits: Mutex::default(),
             white: None,
         }
     }
@@ -230,6 +233,7 @@ impl<'a> Workbench<'a> {
             library: self.library.clone(),
             modelled: self.modelled,
             known: Mutex::default(),
+            limits: Mutex::default(),
             white: Some((whitening, y)),
         })
     }
@@ -278,6 +282,20 @@ impl<'a> Workbench<'a> {
         if let Ok(mut known) = self.known.lock() {
             known.insert(key(from), (to.clone(), sigma, cost));
         }
+    }
+
+    /// What placebos gain of what a model leaves, found once.
+    pub fn limit(&self, model: &Model, find: impl FnOnce() -> f64) -> f64 {
+        let key = key(model);
+        let known = || self.limits.lock().ok()?.get(&key).copied();
+        if let Some(limit) = known() {
+            return limit;
+        }
+        let limit = find();
+        if let Ok(mut limits) = self.limits.lock() {
+            limits.insert(key, limit);
+        }
+        limit
     }
 
     /// Rows that count.
@@ -344,7 +362,12 @@ impl<'a> Workbench<'a> {
         let mut last: Option<(f64, f64)> = None;
         for (t, a) in self.t_s[from..].iter().zip(weights) {
             if let Some((before, previous)) = last {
-                memory = (memory + previous) * (-(t - before).max(0.0) / coloured.tau_s).exp();
+                // A clock that starts anew knows nothing of what was before.
+                memory = if *t < before {
+                    0.0
+                } else {
+                    (memory + previous) * ((before - t) / coloured.tau_s).exp()
+                };
             }
             energy += a * a;
             together += a * memory;
@@ -521,6 +544,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
             _ => reading_step_s,
         },
         fastest_s: 0.02 * step_s.min(reading_step_s),
+        begin_s: problem.observed.t_s.first().copied().unwrap_or_default(),
         span_s,
         ..Scale::default()
     };
