@@ -258,6 +258,17 @@ fn index(summary: &Summary, folder: &Path) -> String {
             shown(&line.anything)
         );
     }
+    let cells = &summary.clean_cells;
+    if cells.named.of > 0 {
+        let _ = writeln!(
+            text,
+            "\nNot among them: {} cells by PyBaMM (b) in which nothing is concealed either, but whose design is a circuit fitted to \
+             them, which leaves something. An effect is named in {}, anything but \"no mismatch\" said of {}.",
+            cells.named.of,
+            shown(&cells.named),
+            shown(&cells.anything)
+        );
+    }
     text.push('\n');
 
     if !summary.methods.is_empty() {

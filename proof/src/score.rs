@@ -125,12 +125,12 @@ pub fn judge(truth: &Truth, strength: f64, removed: &[String], said: Option<&Sai
     let found = wanted.iter().filter(|list| within(list)).count();
     if found == wanted.len() {
         return if wanted.iter().all(|list| exact(list)) {
-            let id = if wanted.len() == 1 {
-                wanted[0].first()
-            } else {
-                None
+            // Of one effect the name that was said: it may be another one that no observer could tell from it.
+            let id = match wanted.as_slice() {
+                [only] => said.named.iter().find(|named| only.contains(&named.id)),
+                _ => None,
             };
-            judgement(Outcome::Exact, false, id.map_or("exact", String::as_str))
+            judgement(Outcome::Exact, false, id.map_or("exact", |named| &named.id))
         } else {
             judgement(Outcome::Class, false, "class")
         };

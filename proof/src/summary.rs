@@ -242,6 +242,8 @@ pub struct Summary {
     pub over_oracle: BTreeMap<String, (usize, f64, f64, Share)>,
     /// By kind.
     pub clean: Vec<Clean>,
+    /// Cells in which nothing is concealed, though the circuit that is their design leaves something of them.
+    pub clean_cells: Clean,
     /// With the true effect taken out: outcomes.
     pub without: Counts,
     /// Every real recording.
@@ -317,7 +319,11 @@ impl Scored<'_> {
 }
 
 /// Counts the outcomes of some cases.
-fn counts<'a>(name: &str, cases: impl Iterator<Item = (&'a Scored<'a>, Judgement)>) -> Counts {
+fn counts<'a>(
+    name: &str,
+    cases: impl Iterator<Item = (&'a Scored<'a>, Judgement)>,
+    right: impl Fn(Outcome) -> bool,
+) -> Counts {
     let cases: Vec<_> = cases.collect();
     let mut outcomes = BTreeMap::new();
     let (mut makers, mut kinds) = (BTreeSet::new(), BTreeSet::new());
@@ -339,7 +345,7 @@ fn counts<'a>(name: &str, cases: impl Iterator<Item = (&'a Scored<'a>, Judgement
         outcomes,
         right: Share::of(
             scored().filter(|(one, _)| one.hidden() && one.plain()),
-            |(_, judged)| judged.outcome.right(),
+            |(_, judged)| right(judged.outcome),
         ),
         wrong: Share::of(scored(), |(_, judged)| judged.outcome == Outcome::Wrong),
         confidently_wrong: Share::of(scored(), |(_, judged)| judged.confident),
@@ -381,6 +387,7 @@ pub fn summary(
                 .iter()
                 .filter(|one| keep(one))
                 .map(|one| (one, one.judged.clone())),
+            Outcome::right,
         )
     };
     let kinds: BTreeSet<&str> = scored.iter().map(|one| one.truth.kind.as_str()).collect();
@@ -402,6 +409,7 @@ pub fn summary(
         scored
             .iter()
             .filter_map(|one| Some((one, one.record.judgement_without()?))),
+        |outcome| outcome == Outcome::Unknown,
     );
     let mut summary = Summary {
         schema: SCHEMA,
@@ -429,6 +437,9 @@ pub fn summary(
         overlap: overlap(&scored),
         over_oracle: over_oracle(&scored),
         clean: clean(&scored),
+        clean_cells: clean_of(&scored, "b", |one| {
+            one.record.planned.group == Group::Cells && !one.hidden()
+        }),
         without,
         real: real(&scored),
         methods: methods(&scored),
@@ -466,7 +477,14 @@ fn confusion(scored: &[Scored<'_>]) -> Vec<Confusion> {
         let line = lines
             .entry((one.truth.kind.clone(), case.effects[0].id.clone()))
             .or_default();
-        *line.entry(one.judged.said.clone()).or_insert(0) += 1;
+        let said = &one.judged.said;
+        let as_right = one.judged.outcome == Outcome::Exact && *said != case.effects[0].id;
+        let said = if as_right && said != "exact" {
+            format!("{said} (as right)")
+        } else {
+            said.clone()
+        };
+        *line.entry(said).or_insert(0) += 1;
     }
     lines
         .into_iter()
@@ -639,22 +657,27 @@ fn over_oracle(scored: &[Scored<'_>]) -> BTreeMap<String, (usize, f64, f64, Shar
     .collect()
 }
 
-fn clean(scored: &[Scored<'_>]) -> Vec<Clean> {
-    let of = |kinds: &[&str], name: &str| {
-        let cases = || {
-            scored.iter().filter(|one| {
-                one.record.planned.group == Group::Clean && kinds.contains(&one.truth.kind.as_str())
-            })
-        };
-        Clean {
-            kind: name.to_owned(),
-            named: Share::of(cases(), |one| one.judged.outcome == Outcome::Wrong),
-            anything: Share::of(cases(), |one| one.judged.outcome != Outcome::Quiet),
-        }
+fn clean_of(scored: &[Scored<'_>], kind: &str, is: impl Fn(&Scored<'_>) -> bool) -> Clean {
+    let cases = || scored.iter().filter(|one| is(one));
+    let named = |one: &&Scored<'_>| {
+        let said = one.record.said.as_ref();
+        said.is_some_and(|said| !said.named.is_empty())
     };
+    Clean {
+        kind: kind.to_owned(),
+        named: Share::of(cases(), named),
+        anything: Share::of(cases(), |one| one.judged.outcome != Outcome::Quiet),
+    }
+}
+
+fn clean(scored: &[Scored<'_>]) -> Vec<Clean> {
     ["b", "c", "d"]
         .into_iter()
-        .map(|kind| of(&[kind], kind))
+        .map(|kind| {
+            clean_of(scored, kind, |one| {
+                one.record.planned.group == Group::Clean && one.truth.kind == kind
+            })
+        })
         .filter(|line| line.named.of > 0)
         .collect()
 }
