@@ -273,6 +273,9 @@ fn one(
         });
     }
     report.models.push(fitted(problem, &selection.fit));
+    report
+        .remarks
+        .extend(base_found(problem, selection.fit.model.nuisance));
     report.plots.push(plots(&read, &shown, &held.read));
     let sentence = sentence(bench, &selection, (verdict, doubted), left, report);
     Part {
@@ -354,6 +357,9 @@ fn decide(
         beside,
     }
 }
+
+/// What a battery is found to be off by is told from here on, in %.
+const TOLD_PERCENT: f64 = 0.1;
 
 fn jumps(residual: &[f64]) -> Vec<f64> {
     residual.windows(2).map(|pair| pair[1] - pair[0]).collect()
@@ -1212,6 +1218,32 @@ pub fn predict(problem: &Problem, effects: &[(String, Vec<f64>)]) -> Vec<f64> {
         .filter_map(|(id, values)| Some((find_with(id, values.len())?, values.as_slice())))
         .collect();
     Chain::new(problem).run(&members, Nuisance::default())
+}
+
+/// What was found of a battery within what the model file leaves open: it is no physics that was left out, and part of every error
+/// after it.
+fn base_found(problem: &Problem, nuisance: Nuisance) -> Option<String> {
+    let by = |share: f64, what: &str, unit: &str| {
+        let percent = 100.0 * share;
+        let way = if percent > 0.0 { "higher" } else { "lower" };
+        (percent.abs() >= TOLD_PERCENT)
+            .then(|| format!("{what} {} {unit} {way}", short(percent.abs())))
+    };
+    let start = "the state of charge at the start";
+    let found: Vec<String> = [
+        by(nuisance.resistance, "the ohmic resistance", "%"),
+        by(nuisance.soc_shift, start, "points of per cent"),
+    ]
+    .into_iter()
+    .flatten()
+    .collect();
+    (!found.is_empty()).then(|| {
+        format!(
+            "{}: within what the model file leaves open, {} than stated fits; the errors after are with that",
+            problem.name,
+            found.join(" and ")
+        )
+    })
 }
 
 fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {

@@ -227,9 +227,7 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
                     .collect(),
             });
         }
-        if !found.is_empty() {
-            shift.take(fitted.nuisance);
-        }
+        shift.take(fitted.nuisance);
     }
     model.extended(&found, shift, file.parent().unwrap_or(Path::new("")), out)
 }

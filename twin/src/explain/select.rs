@@ -62,7 +62,7 @@ pub struct Named {
     pub index: usize,
     /// Share of the held-out loss that goes when it is added last.
     pub held_out_gain: f64,
-    /// 99th percentile of placebos for that step.
+    /// 99th percentile of placebos for the same step.
     pub placebo_p99: f64,
     /// Effects that would have done as well in its place.
     pub equivalent: Vec<&'static str>,
@@ -83,8 +83,6 @@ pub struct Selection {
     pub decisions: Vec<String>,
     /// Candidates that could not be accepted though they were the best at their step, and why not.
     pub refused: Vec<String>,
-    /// Of whatever is random.
-    seed: u64,
 }
 
 impl Selection {
@@ -99,8 +97,14 @@ impl Selection {
 
     /// Asks anew what speaks for each effect, after the model was changed.
     pub fn rename(&mut self, bench: &Workbench<'_>) {
+        let p99: Vec<(&'static str, f64)> = self
+            .named
+            .iter()
+            .zip(&self.ids)
+            .map(|(named, id)| (*id, named.placebo_p99))
+            .collect();
         let others = swapped(bench, &self.fit);
-        self.named = name(bench, &self.fit, &others, self.seed);
+        self.named = name(bench, &self.fit, &others, &p99);
         self.ids = self.fit.model.ids();
     }
 }
@@ -136,6 +140,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
     let mut now = plain.clone();
     let mut decisions = Vec::new();
     let mut refused = Vec::new();
+    let mut step_p99: Vec<(&'static str, f64)> = Vec::new();
     let mut rounds = 0;
     let (now, named) = loop {
         while now.model.members.len() < MOST_EFFECTS {
@@ -153,16 +158,21 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                     bench,
                     &now,
                     &screening,
-                    single.as_ref(),
+                    single.as_ref().map(|(fit, _)| fit),
                     &mut decisions,
                     &mut refused,
                 )
             } else {
                 None
             };
-            let Some(better) = double.or(single) else {
+            let Some((better, p99)) = double.or(single) else {
                 break;
             };
+            for id in better.model.ids() {
+                if !step_p99.iter().any(|(known, _)| *known == id) {
+                    step_p99.push((id, p99));
+                }
+            }
             now = better;
         }
         rounds += 1;
@@ -170,40 +180,52 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
             0.85,
             "trying to do without each effect, and with others in its place",
         );
-        if let Some(leaner) = backward(bench, &now, seed, &mut decisions) {
+        if let Some(leaner) = backward(bench, &now, (&step_p99, 1), &mut decisions) {
             now = leaner;
         }
         let others = swapped(bench, &now);
         let better = (rounds < ROUNDS).then(|| swap(bench, &now, &others, &mut decisions));
         match better.flatten() {
             // A better model may have room for another effect.
-            Some(better) => now = better,
+            Some((index, better)) => {
+                inherit(&mut step_p99, &now, index, &better);
+                now = better;
+            }
             None => {
                 progress(0.92, "asking which other effects would do as well");
                 let mut now = polish(bench, &now);
                 let mut others = others;
                 // The last exchange may have made another one needless.
-                if let Some(leaner) = backward(bench, &now, seed, &mut decisions) {
+                if let Some(leaner) = backward(bench, &now, (&step_p99, 1), &mut decisions) {
                     now = polish(bench, &leaner);
                     others = swapped(bench, &now);
                 }
-                let mut named = name(bench, &now, &others, seed);
+                let mut named = name(bench, &now, &others, &step_p99);
                 // Of equals the plainest is named.
                 for _ in 0..now.model.members.len() {
-                    let Some(plainer) = plainer(bench, &now, &others, &named) else {
+                    let Some((index, plainer)) = plainer(bench, &now, &others, &named) else {
                         break;
                     };
+                    inherit(&mut step_p99, &now, index, &plainer);
                     decisions.push(format!(
                         "{} named of its equals: its equation is exact.",
                         plainer.model.members.last().map_or("", Member::id)
                     ));
                     now = polish(bench, &plainer);
                     // What only made up for the other equation goes with it.
-                    if let Some(leaner) = backward(bench, &now, seed, &mut decisions) {
+                    if let Some(leaner) = backward(bench, &now, (&step_p99, 1), &mut decisions) {
                         now = polish(bench, &leaner);
                     }
                     others = swapped(bench, &now);
-                    named = name(bench, &now, &others, seed);
+                    named = name(bench, &now, &others, &step_p99);
+                }
+                // Only now that nothing is exchanged any more does each have to be missed, not the least alone.
+                if let Some(leaner) =
+                    backward(bench, &now, (&step_p99, MOST_EFFECTS), &mut decisions)
+                {
+                    now = polish(bench, &leaner);
+                    others = swapped(bench, &now);
+                    named = name(bench, &now, &others, &step_p99);
                 }
                 // Small, and as well explained by many others: that is structure, and no name.
                 let Some(vague) = named.iter().find(|one| {
@@ -223,7 +245,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                 ));
                 let now = fit(bench, &now.model.without(vague.index), None);
                 let others = swapped(bench, &now);
-                let named = name(bench, &now, &others, seed);
+                let named = name(bench, &now, &others, &step_p99);
                 break (now, named);
             }
         }
@@ -236,7 +258,6 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
         named,
         decisions,
         refused,
-        seed,
     }
 }
 
@@ -369,7 +390,7 @@ fn step(
     screening: &Screening,
     decisions: &mut Vec<String>,
     refused: &mut Vec<String>,
-) -> Option<Fit> {
+) -> Option<(Fit, f64)> {
     let models = promising(bench, now, &screening.entries, FITTED, STARTS);
     let fits = fits(bench, models);
     let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
@@ -415,7 +436,7 @@ fn step(
                     DRAWS,
                     percent(screening.placebo_p99)
                 ));
-                return Some(better);
+                return Some((better, screening.placebo_p99));
             }
         }
     }
@@ -625,7 +646,7 @@ fn pair(
     single: Option<&Fit>,
     decisions: &mut Vec<String>,
     refused: &mut Vec<String>,
-) -> Option<Fit> {
+) -> Option<(Fit, f64)> {
     // What one effect explains so well needs no second one to be found.
     if single.is_some_and(|single| share(bench, now, single) > CLEAR) {
         return None;
@@ -683,7 +704,7 @@ fn pair(
         ids[count - 1],
         percent(share(bench, now, &best))
     ));
-    Some(best)
+    Some((best, screening.placebo_p99))
 }
 
 /// Share of the held-out error that two effects have to take together: each may gain what a placebo gains.
@@ -731,19 +752,27 @@ fn unfit(
     })
 }
 
-/// What placebos gain of what a model leaves: the least that an effect has to take to be added to it.
-fn limit(bench: &Workbench<'_>, without: &Fit, seed: u64) -> f64 {
-    bench.limit(&without.model, || {
-        let seed = seed.wrapping_add(without.model.members.len() as u64);
-        screen(bench, without, seed, DRAWS).placebo_p99
-    })
+fn p99_of(step_p99: &[(&'static str, f64)], id: &str) -> f64 {
+    step_p99
+        .iter()
+        .find(|(known, _)| *known == id)
+        .map_or(0.0, |(_, p99)| *p99)
 }
 
-/// Leaves out what is no longer missed.
+/// What takes the place of the effect at an index has to beat the same placebos.
+fn inherit(step_p99: &mut Vec<(&'static str, f64)>, before: &Fit, index: usize, after: &Fit) {
+    let p99 = p99_of(step_p99, before.model.members[index].id());
+    if let Some(last) = after.model.members.last() {
+        step_p99.retain(|(known, _)| *known != last.id());
+        step_p99.push((last.id(), p99));
+    }
+}
+
+/// Leaves out what is no longer missed with the others there, of the `looked_at` effects that are missed least.
 fn backward(
     bench: &Workbench<'_>,
     now: &Fit,
-    seed: u64,
+    (step_p99, looked_at): (&[(&'static str, f64)], usize),
     decisions: &mut Vec<String>,
 ) -> Option<Fit> {
     let mut leaner: Option<Fit> = None;
@@ -752,27 +781,30 @@ fn backward(
         if here.model.members.len() < 2 {
             return leaner;
         }
-        // Each has to be missed, with the others there; of those that are not, the least goes first.
-        let tried: Vec<(usize, Fit, f64, String)> = (0..here.model.members.len())
+        let mut tried: Vec<(usize, Fit, f64)> = (0..here.model.members.len())
             .into_par_iter()
-            .filter_map(|index| {
+            .map(|index| {
                 let without = fit(bench, &here.model.without(index), None);
                 let missed = share(bench, &without, here);
-                let placebos = limit(bench, &without, seed);
-                let why = if missed <= placebos {
-                    format!(
-                        "takes only {} of the held-out error, placebos up to {}",
-                        percent(missed),
-                        percent(placebos)
-                    )
-                } else {
-                    obstacle(bench, &without, here, index, missed)?
-                };
-                Some((index, without, missed, why))
+                (index, without, missed)
             })
             .collect();
-        let least = tried.into_iter().min_by(|a, b| a.2.total_cmp(&b.2));
-        let Some((index, without, _, why)) = least else {
+        tried.sort_by(|a, b| a.2.total_cmp(&b.2));
+        tried.truncate(looked_at);
+        let needless = tried.into_iter().find_map(|(index, without, missed)| {
+            let placebos = p99_of(step_p99, here.model.members[index].id());
+            let why = if missed <= placebos {
+                format!(
+                    "takes only {} of the held-out error, placebos up to {}",
+                    percent(missed),
+                    percent(placebos)
+                )
+            } else {
+                obstacle(bench, &without, here, index, missed)?
+            };
+            Some((index, without, why))
+        });
+        let Some((index, without, why)) = needless else {
             return leaner;
         };
         let id = here.model.members[index].id();
@@ -854,7 +886,7 @@ fn swap(
     now: &Fit,
     others: &[(usize, Fit)],
     decisions: &mut Vec<String>,
-) -> Option<Fit> {
+) -> Option<(usize, Fit)> {
     let sigma = others
         .iter()
         .map(|(_, fit)| fit.sigma)
@@ -883,17 +915,17 @@ fn swap(
         best.model.members[last].id(),
         percent((here - loss) / here)
     ));
-    Some(best.clone())
+    Some((index, best.clone()))
 }
 
-/// The model with an effect replaced by one of its equals whose equation is exact (a constant, a factor, a time), if the effect's
+/// The model with an effect, at the index that comes with it, replaced by one of its equals whose equation is exact (a constant, a factor, a time), if the effect's
 /// own is not.
 fn plainer(
     bench: &Workbench<'_>,
     now: &Fit,
     others: &[(usize, Fit)],
     named: &[Named],
-) -> Option<Fit> {
+) -> Option<(usize, Fit)> {
     let exact = |member: &Member| member.effect.idealised() == 0.0;
     named
         .iter()
@@ -911,19 +943,24 @@ fn plainer(
                     }) && !beaten(bench, fit, now)
                 })
                 .min_by(|a, b| a.cost.total_cmp(&b.cost))
-                .cloned()
+                .map(|fit| (one.index, fit.clone()))
         })
 }
 
 /// What speaks for each effect, and what would have done as well.
-fn name(bench: &Workbench<'_>, now: &Fit, others: &[(usize, Fit)], seed: u64) -> Vec<Named> {
+fn name(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    others: &[(usize, Fit)],
+    step_p99: &[(&'static str, f64)],
+) -> Vec<Named> {
     (0..now.model.members.len())
         .map(|index| {
+            let id = now.model.members[index].id();
             let without = fit(bench, &now.model.without(index), None);
             let taken = share(bench, &without, now);
-            let placebo_p99 = limit(bench, &without, seed);
             // Where few rows decide, the difference of two models is never certain: who takes much less is no equal.
-            let least = (EQUAL * taken).max(placebo_p99);
+            let least = (EQUAL * taken).max(p99_of(step_p99, id));
             let beside = beside(bench, now, index);
             let mut equivalent: Vec<&'static str> = others
                 .iter()
@@ -943,7 +980,7 @@ fn name(bench: &Workbench<'_>, now: &Fit, others: &[(usize, Fit)], seed: u64) ->
             Named {
                 index,
                 held_out_gain: taken,
-                placebo_p99,
+                placebo_p99: p99_of(step_p99, id),
                 equivalent,
             }
         })

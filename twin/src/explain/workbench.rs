@@ -112,8 +112,6 @@ pub struct Workbench<'a> {
     pub modelled: f64,
     /// Fits that were made: from which model to which, with spread and loss.
     known: Mutex<HashMap<Key, (Model, f64, f64)>>,
-    /// What placebos gain of what models leave.
-    limits: Mutex<HashMap<Key, f64>>,
     /// Makes the stated noise white, with the readings after it.
     white: Option<(Whitening, Vec<f64>)>,
 }
@@ -209,7 +207,6 @@ impl<'a> Workbench<'a> {
             blocks,
             library,
             known: Mutex::default(),
-            limits: Mutex::default(),
             white: None,
         }
     }
@@ -233,7 +230,6 @@ impl<'a> Workbench<'a> {
             library: self.library.clone(),
             modelled: self.modelled,
             known: Mutex::default(),
-            limits: Mutex::default(),
             white: Some((whitening, y)),
         })
     }
@@ -282,20 +278,6 @@ impl<'a> Workbench<'a> {
         if let Ok(mut known) = self.known.lock() {
             known.insert(key(from), (to.clone(), sigma, cost));
         }
-    }
-
-    /// What placebos gain of what a model leaves, found once.
-    pub fn limit(&self, model: &Model, find: impl FnOnce() -> f64) -> f64 {
-        let key = key(model);
-        let known = || self.limits.lock().ok()?.get(&key).copied();
-        if let Some(limit) = known() {
-            return limit;
-        }
-        let limit = find();
-        if let Ok(mut limits) = self.limits.lock() {
-            limits.insert(key, limit);
-        }
-        limit
     }
 
     /// Rows that count.

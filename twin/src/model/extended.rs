@@ -135,10 +135,12 @@ impl Extension<'_> {
                 "initial_soc",
                 value((soc + self.shift.soc).clamp(0.0, 1.0)),
             );
+            was(table, "initial_soc", soc);
         }
         if self.shift.resistance != 0.0 {
             let resistance = battery.resistance_ohm * (1.0 + self.shift.resistance);
             set(table, "ohmic_resistance_ohm", value(resistance));
+            was(table, "ohmic_resistance_ohm", battery.resistance_ohm);
         }
     }
 }
@@ -153,6 +155,18 @@ fn set(table: &mut dyn TableLike, key: &str, mut new: Item) {
         *new.decor_mut() = old.decor().clone();
     }
     *place = new;
+}
+
+/// Says ahead of a value what was stated.
+fn was(table: &mut dyn TableLike, key: &str, stated: f64) {
+    if let Some(mut key) = table.key_mut(key) {
+        let decor = key.leaf_decor_mut();
+        let before = decor.prefix().and_then(|prefix| prefix.as_str());
+        let before = before.unwrap_or_default();
+        decor.set_prefix(format!(
+            "{before}# Found by twin explain within its uncertainty; stated as {stated}.\n"
+        ));
+    }
 }
 
 /// A file as named from another folder, which need not be there yet. `None` where neither can be found.

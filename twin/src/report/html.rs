@@ -296,7 +296,7 @@ fn effects(page: &mut String, report: &Report) {
         page.push_str(if report.verdict == Verdict::NoMismatch {
             "<p>None is needed.</p>\n"
         } else {
-            "<p>None is named: no effect of the library both held on samples that were not fitted and beat its placebos.</p>\n"
+            "<p>None is named. What was tried, and why it was not enough, is told under “How it was decided”.</p>\n"
         });
     }
     for (number, effect) in report.effects.iter().enumerate() {
