@@ -3,6 +3,7 @@
 mod calibration;
 
 use std::{
+    collections::HashSet,
     fs,
     io::Write,
     path::{Path, PathBuf},
@@ -15,7 +16,8 @@ use crate::{
     explain::{self, Holdout, Options},
     failure::Failure,
     model::{Found, Model, Shift, registry},
-    prepare::{Inputs, Purpose, prepare},
+    overwrite,
+    prepare::{Inputs, Item, Prepared, Purpose, prepare},
     progress::Progress,
     report::{
         data::{self, Report},
@@ -31,6 +33,15 @@ Example:
 Writes report/report.json, report/report.html (one file, no network) and report/model.toml, the model file with the
 physics that was found; report/calibration.toml where the board can correct it. docs/model-file.md describes the model
 file, `twin effects` lists the physics that is looked for.";
+/// What is written; the last only where the board can correct something.
+const FILES: [&str; 4] = [
+    "report.json",
+    "report.html",
+    "model.toml",
+    "calibration.toml",
+];
+/// A hold-out of which more of the changes are found in the fitted recording is a copy of it.
+const COPIED: f64 = 0.9;
 /// Width of the summary where the terminal does not tell its own.
 const WIDTH: usize = 100;
 
@@ -81,7 +92,21 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             out.display()
         )));
     }
+    let refuse = |file: Option<(&str, &Path)>| {
+        let mut written = FILES.iter().map(|name| out.join(name));
+        written.try_for_each(|written| overwrite::refuse(&written, file))
+    };
+    let read = [
+        ("--model", &arguments.model),
+        ("--recording", &arguments.recording),
+    ];
+    let reference = arguments.reference.iter().map(|path| ("--reference", path));
+    let holdout = arguments.holdout.iter().map(|path| ("--holdout", path));
+    for (argument, path) in read.into_iter().chain(reference).chain(holdout) {
+        refuse(Some((argument, path)))?;
+    }
     let model = Model::read(&arguments.model)?;
+    refuse(model.ocv_file())?;
     let reading = Progress::new(format!("reading {}", arguments.recording.display()));
     let inputs = Inputs {
         recording: arguments.recording.clone(),
@@ -98,6 +123,13 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             mapping: arguments.map.clone(),
         };
         let other = prepare(&model, &inputs, Purpose::Compare)?;
+        if let Some(signal) = copied(&prepared, &other) {
+            return Err(Failure::Input(format!(
+                "{}, column {signal}: found the readings of {}, expected another recording: a hold-out is never fitted",
+                file.display(),
+                arguments.recording.display()
+            )));
+        }
         remarks.extend(
             other
                 .remarks
@@ -134,13 +166,14 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     let calibration = calibration::calibrate(&model, &report);
     report.remarks.extend(calibration.remarks);
     let extended = extended(&model, &report, &arguments.model, out)?;
+    let [json, page, model, registers] = FILES;
     let mut files = vec![
-        ("report.json", json::render(&report)),
-        ("report.html", html::render(&report)),
-        ("model.toml", extended),
+        (json, json::render(&report)),
+        (page, html::render(&report)),
+        (model, extended),
     ];
     if let Some(text) = calibration.text {
-        files.push(("calibration.toml", text));
+        files.push((registers, text));
     }
     write(out, &files)?;
     let width = std::env::var("COLUMNS")
@@ -149,6 +182,33 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     Ok(text::render(&report, width.unwrap_or(WIDTH))
         .trim_end()
         .to_owned())
+}
+
+/// The first signal of a hold-out whose readings are those of the fitted recording, at the same times of their own clocks.
+/// Only those that differ from the one before are looked at: at rest two recordings may read the same.
+fn copied(fitted: &Prepared, other: &Prepared) -> Option<String> {
+    let changes = |prepared: &Prepared, item: &Item| -> Vec<(u64, u64)> {
+        let observed = &item.problem.observed;
+        let mut last = f64::NAN;
+        let mut changes = Vec::new();
+        for row in (0..observed.value.len()).filter(|row| observed.valid[*row]) {
+            let (value, own) = (observed.value[row], item.rows.get(row).copied());
+            let t_s = own.and_then(|row| prepared.t_s.get(row).copied());
+            if let Some(t_s) = t_s.filter(|_| value != last) {
+                changes.push((t_s.to_bits(), value.to_bits()));
+            }
+            last = value;
+        }
+        changes
+    };
+    other.items.iter().find_map(|item| {
+        let name = &item.problem.name;
+        let same = fitted.items.iter().find(|one| one.problem.name == *name)?;
+        let known: HashSet<(u64, u64)> = changes(fitted, same).into_iter().collect();
+        let found = changes(other, item);
+        let shared = found.iter().filter(|change| known.contains(change)).count();
+        (shared as f64 > COPIED * found.len() as f64).then(|| name.clone())
+    })
 }
 
 /// All files, or none.

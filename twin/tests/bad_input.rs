@@ -332,3 +332,103 @@ fn an_implausible_reference_is_said_to_be_one() {
     written.sort();
     assert_eq!(written, ["model.toml", "report.html", "report.json"]);
 }
+
+/// The report of a run that goes well.
+fn report(files: &[(&str, &str)], arguments: &[&str]) -> serde_json::Value {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, content) in files {
+        fs::write(folder.path().join(name), content).unwrap();
+    }
+    let output = Command::new(env!("CARGO_BIN_EXE_twin"))
+        .args(["explain", "--model", "m.toml", "--recording", "r.csv"])
+        .args(["--out", "out"])
+        .args(arguments)
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(0), "{output:?}");
+    let report = fs::read_to_string(folder.path().join("out/report.json")).unwrap();
+    serde_json::from_str(&report).unwrap()
+}
+
+#[test]
+fn a_file_that_is_read_is_not_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    fs::create_dir(path("out")).unwrap();
+    let files = [
+        ("out/model.toml", PAIR.to_owned()),
+        ("out/report.json", good()),
+        ("r.csv", good()),
+        (
+            "b.toml",
+            "schema = 1\n[battery]\ncapacity_ah = 2\nocv_file = \"ocv.csv\"\n".to_owned(),
+        ),
+        ("ocv.csv", "soc,ocv_v\n0,3\n1,4\n".to_owned()),
+    ];
+    for (name, content) in &files {
+        fs::write(path(name), content).unwrap();
+    }
+    #[cfg(unix)]
+    std::os::unix::fs::symlink("r.csv", path("link.csv")).unwrap();
+    #[cfg(not(unix))]
+    fs::write(path("link.csv"), good()).unwrap();
+    let simulate = ["simulate", "--model", "out/model.toml", "--recording"];
+    let explain = ["explain", "--out", "out", "--recording", "r.csv", "--model"];
+    let cases: [(&[&str], &[&str], &str); 6] = [
+        (
+            &simulate,
+            &["r.csv", "--out", "./out/../r.csv"],
+            "--recording",
+        ),
+        (&simulate, &["link.csv", "--out", "r.csv"], "--recording"),
+        (
+            &["simulate", "--model", "b.toml"],
+            &["--recording", "r.csv", "--out", "ocv.csv"],
+            "ocv_file",
+        ),
+        (&["convert", "r.csv"], &["--out", "r.csv"], "IN"),
+        (&explain, &["out/model.toml"], "--model"),
+        (
+            &explain,
+            &["b.toml", "--holdout", "out/report.json"],
+            "--holdout",
+        ),
+    ];
+    for (first, rest, argument) in cases {
+        let output = Command::new(env!("CARGO_BIN_EXE_twin"))
+            .args(first)
+            .args(rest)
+            .current_dir(folder.path())
+            .output()
+            .unwrap();
+        let sentence = String::from_utf8(output.stderr).unwrap();
+        if cfg!(unix) || !first.contains(&"link.csv") {
+            assert_eq!(output.status.code(), Some(2), "{rest:?} {sentence}");
+            says(&sentence, &["found the file that is read as", argument]);
+        }
+        for (name, content) in &files {
+            assert_eq!(fs::read_to_string(path(name)).unwrap(), *content, "{name}");
+        }
+    }
+}
+
+#[test]
+fn a_hold_out_that_was_fitted() {
+    let files = [("m.toml", PAIR), ("r.csv", &good()), ("copy.csv", &good())];
+    let arguments = ["explain", "--model", "m.toml", "--recording", "r.csv"];
+    let holdout = ["--out", "out", "--holdout", "copy.csv"];
+    says(
+        &refused(&files, &[&arguments[..], &holdout].concat()),
+        &[
+            "copy.csv, column i_meas_a",
+            "readings of r.csv",
+            "never fitted",
+        ],
+    );
+    // Of the same drive, read anew.
+    let other = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| format!("{t},{},{}", current(t), current(t) + 0.51));
+    let files = [("m.toml", PAIR), ("r.csv", &good()), ("copy.csv", &other)];
+    report(&files, &["--holdout", "copy.csv"]);
+}

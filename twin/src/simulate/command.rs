@@ -10,6 +10,7 @@ use crate::{
     explain,
     failure::Failure,
     model::Model,
+    overwrite,
     prepare::{Inputs, Item, Prepared, Purpose, prepare},
     problem::{Base, Problem, View},
     progress::Progress,
@@ -47,7 +48,15 @@ pub struct Arguments {
 /// Simulates, and says in a few lines what was written.
 pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     convert::is_parquet(&arguments.out)?;
+    let reference = arguments.reference.as_deref();
+    let read = [
+        ("--model", arguments.model.as_path()),
+        ("--recording", arguments.recording.as_path()),
+    ];
+    let reference = reference.map(|path| ("--reference", path));
+    overwrite::refuse(&arguments.out, read.into_iter().chain(reference))?;
     let model = Model::read(&arguments.model)?;
+    overwrite::refuse(&arguments.out, model.ocv_file())?;
     let inputs = Inputs {
         recording: arguments.recording.clone(),
         reference: arguments.reference.clone(),
