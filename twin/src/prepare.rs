@@ -141,6 +141,9 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
     if items.is_empty() {
         return Err(nothing_to_compare(model, &frame));
     }
+    if purpose == Purpose::Compare {
+        work.not_compared(&items);
+    }
     for item in &mut items {
         model_effects(model, item);
         if purpose == Purpose::Compare {
@@ -198,9 +201,43 @@ impl<'a> Work<'a> {
         }
     }
 
+    /// Says what the model file states and the recording has no column for.
+    fn not_compared(&mut self, items: &[Item]) {
+        let has = |view| items.iter().any(|item| item.problem.view == view);
+        let model = self.model;
+        if let Some(sensor) = model.sensor.as_ref().filter(|_| !has(View::Sensor))
+            && let Ok((_, measured)) = self.names(sensor)
+        {
+            self.remark(format!(
+                "[sensor]'s readings are not compared: no column {measured} in {}",
+                self.frame.source()
+            ));
+        }
+        if let Some(charge) = model.charge.as_ref().filter(|_| !has(View::Charge)) {
+            self.remark(format!(
+                "[charge] is not compared: no column {} in {}",
+                charge.column.as_deref().unwrap_or("q_meas_c"),
+                self.frame.source()
+            ));
+        }
+        if let Some(battery) = &model.battery {
+            battery::not_compared(self, battery, items);
+        }
+    }
+
     /// The sensor, and its charge counter.
     fn sensor(&mut self, sensor: &Sensor) -> Result<Vec<Item>, Failure> {
         let (reference, measured) = self.names(sensor)?;
+        let column = self.frame.origin(&measured);
+        if self.purpose == Purpose::Compare
+            && self.reference.is_none()
+            && self.frame.origin(&reference) == column
+        {
+            return Err(Failure::Input(format!(
+                "{}: found the column {column} as the sensor's reference and as its reading, expected two columns",
+                self.frame.source()
+            )));
+        }
         let found = self.drive_frame().need(&reference)?;
         checks::some_values(&found, &reference, self.drive_frame().source())?;
         let value = self.frame.column(&measured);
@@ -245,9 +282,11 @@ impl<'a> Work<'a> {
             None => (series::every_row(&drive), Arc::clone(&parts.rows)),
         };
         if self.purpose == Purpose::Compare && value.is_some() {
+            let wild = checks::wild(&drive, &observed);
+            let names = [reference.as_str(), measured.as_str()];
             let (errors, remarks) = (
-                checks::pair(&drive, &observed, &reference, &measured),
-                checks::plausible(&drive, &observed, sensor, &reference, &measured),
+                checks::pair(&drive, &observed, &wild, self.frame.source(), names),
+                checks::plausible(&drive, &observed, &wild, sensor, names),
             );
             for remark in remarks {
                 self.remark(remark);

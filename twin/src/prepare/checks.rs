@@ -1,10 +1,11 @@
 //! What cannot be explained because the input is not what it is said to be: each its own clear error.
 
-use super::{FEWEST_ROWS, seconds, series::median};
+use super::{FEWEST_ROWS, battery::PACK, seconds, series::median};
 use crate::{
     failure::Failure,
     model::Sensor,
     problem::{BatteryBase, Drive, Observed, Problem, View},
+    report::format::count,
 };
 
 /// A ratio of two spreads is a power of 1000 if it is within this factor of one.
@@ -13,6 +14,13 @@ const POWER_WITHIN: f64 = 2.0;
 const OPPOSITE: f64 = -0.5;
 /// Below this magnitude of correlation the two have nothing in common.
 const UNRELATED: f64 = 0.1;
+/// A voltage further than this beyond the table's ends, as a factor, is not that of so many cells.
+const OTHER_CELLS: f64 = 1.8;
+/// A jump there and back is one if it is larger than this share of the spread of all, and than so many usual steps.
+const WILD_SHARE: f64 = 0.25;
+const WILD_STEPS: f64 = 20.0;
+/// More such readings than this share are no longer single ones.
+const WILD_MOST: f64 = 0.02;
 /// A share of the readings at an end of their range that is worth a remark.
 const CLIPPED_SHARE: f64 = 0.005;
 
@@ -87,14 +95,16 @@ fn beside<'a>(
     observed: &'a Observed,
 ) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
     let counted = (0..observed.t_s.len()).filter(|row| observed.valid[*row]);
-    counted.map(|row| {
-        let reference = if observed.on_drive_rows {
-            drive.reference[row]
-        } else {
-            at(drive, observed.segment_of(row), observed.t_s[row])
-        };
-        (reference, observed.value[row])
-    })
+    counted.map(|row| (reference_at(drive, observed, row), observed.value[row]))
+}
+
+/// The reference at a reading.
+fn reference_at(drive: &Drive, observed: &Observed, row: usize) -> f64 {
+    if observed.on_drive_rows {
+        drive.reference[row]
+    } else {
+        at(drive, observed.segment_of(row), observed.t_s[row])
+    }
 }
 
 fn at(drive: &Drive, segment: usize, t_s: f64) -> f64 {
@@ -165,14 +175,69 @@ fn thousands(ratio: f64) -> Option<i32> {
     (power != 0.0 && near).then_some(power as i32)
 }
 
+/// Single readings that jump there and back though the reference does not, each with what it would be between its
+/// neighbours. None where the reference has such jumps too, which may only show later, and where they are no longer single.
+pub(super) fn wild(drive: &Drive, observed: &Observed) -> Vec<(usize, f64)> {
+    let rows = || (0..observed.t_s.len()).filter(|row| observed.valid[*row]);
+    let steps = rows().zip(rows().skip(1));
+    let steps = steps.map(|(from, to)| (observed.value[to] - observed.value[from]).abs());
+    let Some(typical) = median(&mut steps.collect::<Vec<_>>()) else {
+        return Vec::new();
+    };
+    let wide = spread(rows().map(|row| observed.value[row]));
+    let least = (WILD_SHARE * wide).max(WILD_STEPS * typical);
+    let jump = |[before, now, after]: [f64; 3]| {
+        let back = (now - before) * (now - after) > 0.0;
+        let jump = (now - before).abs().min((now - after).abs());
+        if back { jump } else { 0.0 }
+    };
+    let mut found = Vec::new();
+    let mut in_reference = 0;
+    let threes = rows().zip(rows().skip(1)).zip(rows().skip(2));
+    for own in threes.map(|((before, now), after)| [before, now, after]) {
+        if observed.segment_of(own[0]) != observed.segment_of(own[2]) {
+            continue;
+        }
+        let readings = own.map(|row| observed.value[row]);
+        let size = jump(readings);
+        if size > least {
+            let references = own.map(|row| reference_at(drive, observed, row));
+            let shown = (references[1] - 0.5 * (references[0] + references[2])).abs();
+            if shown < 0.1 * size {
+                found.push((own[1], 0.5 * (readings[0] + readings[2])));
+            }
+        }
+        if observed.on_drive_rows && jump(own.map(|row| drive.reference[row])) > least {
+            in_reference += 1;
+        }
+    }
+    if in_reference > 0 || found.len() as f64 > WILD_MOST * rows().count() as f64 {
+        return Vec::new();
+    }
+    found
+}
+
+/// The pairs without the wild readings.
+fn without<'a>(
+    drive: &'a Drive,
+    observed: &'a Observed,
+    wild: &'a [(usize, f64)],
+) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
+    let counted = (0..observed.t_s.len()).filter(|row| observed.valid[*row]);
+    counted
+        .filter(|row| wild.binary_search_by_key(row, |(row, _)| *row).is_err())
+        .map(|row| (reference_at(drive, observed, row), observed.value[row]))
+}
+
 /// Units and signs of a sensor and its reference.
 pub(super) fn pair(
     drive: &Drive,
     observed: &Observed,
-    reference: &str,
-    measured: &str,
+    wild: &[(usize, f64)],
+    source: &str,
+    [reference, measured]: [&str; 2],
 ) -> Result<(), Failure> {
-    let pairs = beside(drive, observed);
+    let pairs = without(drive, observed, wild);
     if pairs.clone().count() < FEWEST_ROWS {
         return Ok(());
     }
@@ -186,7 +251,7 @@ pub(super) fn pair(
         };
         let factor = 1000_f64.powi(power.abs());
         return Err(Failure::Input(format!(
-            "{large} moves by {:.4} and {small} by {:.4}, a factor near {factor}: found two units, expected the same \
+            "{source}: {large} moves by {:.4} and {small} by {:.4}, a factor near {factor}: found two units, expected the same \
              unit in both (one of them may be in thousandths)",
             spread_x.max(spread_y),
             spread_x.min(spread_y)
@@ -195,7 +260,7 @@ pub(super) fn pair(
     let together = correlation(pairs);
     if together < OPPOSITE {
         return Err(Failure::Input(format!(
-            "{measured} falls where {reference} rises (correlation {together:.2}): found opposite signs, expected \
+            "{source}: {measured} falls where {reference} rises (correlation {together:.2}): found opposite signs, expected \
              discharge positive in both; to turn one: --map {measured}=-{measured}"
         )));
     }
@@ -206,16 +271,16 @@ pub(super) fn pair(
 pub(super) fn plausible(
     drive: &Drive,
     observed: &Observed,
+    wild: &[(usize, f64)],
     sensor: &Sensor,
-    reference: &str,
-    measured: &str,
+    [reference, measured]: [&str; 2],
 ) -> Vec<String> {
     let mut remarks = Vec::new();
     let pairs = beside(drive, observed);
     if pairs.clone().count() < FEWEST_ROWS {
         return remarks;
     }
-    let together = correlation(pairs.clone());
+    let together = correlation(without(drive, observed, wild));
     if together.abs() < UNRELATED {
         remarks.push(format!(
             "{measured} does not follow {reference} (correlation {together:.2}): the reference may be that of another conductor"
@@ -239,6 +304,15 @@ pub(super) fn plausible(
         }
     }
     remarks.extend(clipped(pairs, measured));
+    if let Some((row, between)) = wild.first() {
+        remarks.push(format!(
+            "{measured} jumps there and back within one row in {} that {reference} does not show, the first at {} s: {} \
+             between readings around {between:.4}; such readings may keep anything from fitting",
+            count(wild.len(), "place"),
+            shown(observed.t_s[*row]),
+            observed.value[*row]
+        ));
+    }
     remarks.extend(spikes(drive, observed, reference));
     remarks.extend(stuck(drive, observed, reference, measured));
     remarks
@@ -348,8 +422,7 @@ pub(super) fn battery(
     drive: &Drive,
     observed: &Observed,
     base: &BatteryBase,
-    name: &str,
-    current: &str,
+    [source, name, current]: [&str; 3],
 ) -> Result<(), Failure> {
     let pairs = beside(drive, observed);
     if pairs.clone().count() < FEWEST_ROWS {
@@ -359,7 +432,7 @@ pub(super) fn battery(
         let most = pairs.fold(0.0_f64, |most, (_, soc)| most.max(soc.abs()));
         if most <= 1.01 {
             return Err(Failure::Input(format!(
-                "{name}: found values up to {most}, expected per cent, 0 to 100"
+                "{source}, column {name}: found values up to {most}, expected per cent, 0 to 100"
             )));
         }
         return Ok(());
@@ -371,8 +444,26 @@ pub(super) fn battery(
     };
     if let Some(power) = thousands(middle / designed) {
         return Err(Failure::Input(format!(
-            "{name}: found voltages around {middle:.4}, 10^{} times the open-circuit voltage {designed:.4} V, expected V",
+            "{source}, column {name}: found voltages around {middle:.4}, 10^{} times the open-circuit voltage {designed:.4} V, expected V",
             3 * power
+        )));
+    }
+    let volts = base.ocv.iter().map(|(_, volts)| *volts);
+    let (low, high) = volts.fold((f64::INFINITY, 0.0_f64), |(low, high), volts| {
+        (low.min(volts), high.max(volts))
+    });
+    if middle > OTHER_CELLS * high || middle < low / OTHER_CELLS {
+        let hint = if name == PACK {
+            format!(
+                "; cells = {} in [battery] says how many are in series",
+                base.cells
+            )
+        } else {
+            format!("; a pack's voltage is {PACK}, with cells in [battery]")
+        };
+        return Err(Failure::Input(format!(
+            "{source}, column {name}: found voltages around {middle:.4} V, expected some within reach of the open-circuit \
+             voltage, {low:.4} … {high:.4} V{hint}"
         )));
     }
     // From one reading to the next the slow open-circuit voltage hardly matters.
@@ -383,7 +474,7 @@ pub(super) fn battery(
     let together = correlation(steps);
     if together > -OPPOSITE {
         return Err(Failure::Input(format!(
-            "{name} rises where {current} rises (correlation {together:.2}): found charging positive, expected discharge \
+            "{source}: {name} rises where {current} rises (correlation {together:.2}): found charging positive, expected discharge \
              positive; to turn it: --map {current}=-{current}"
         )));
     }
