@@ -21,6 +21,7 @@ use crate::{
     progress::Progress,
     report::{
         data::{self, Report},
+        format::quantity,
         html, json, text,
     },
 };
@@ -154,6 +155,7 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     drop(explaining);
     remarks.append(&mut report.remarks);
     report.remarks = remarks;
+    report.name_values();
     report.inputs = data::Inputs {
         model: arguments.model.display().to_string(),
         recording: arguments.recording.display().to_string(),
@@ -161,6 +163,7 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             .reference
             .as_ref()
             .map(|path| path.display().to_string()),
+        without: arguments.without.clone(),
         out: Some(out.display().to_string()),
     };
     let calibration = calibration::calibrate(&model, &report);
@@ -274,8 +277,10 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
             ];
             for parameter in &said.parameters {
                 comment.push(format!(
-                    "{}: 95 % interval {} to {} {}",
-                    parameter.name, parameter.ci95[0], parameter.ci95[1], parameter.unit
+                    "{}: 95 % interval {} to {}",
+                    parameter.name,
+                    parameter.ci95[0],
+                    quantity(&parameter.ci95[1].to_string(), &parameter.unit)
                 ));
             }
             found.push(Found {

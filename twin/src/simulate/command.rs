@@ -22,7 +22,9 @@ Example:
   twin simulate --model board.toml --recording drive.csv --out simulated.csv
 
 Writes t_s and, under the names of the recording, what the sensor, its charge counter and the battery of the model would
-have reported: as designed, and with the effects that the model file holds. docs/model-file.md describes the model file.";
+have reported: as designed, and with the effects that the model file holds. A column that --map calls by another name or
+turns is written under its new name and with its new sign: --map i_meas_a=-I writes i_meas_a, discharge positive.
+docs/model-file.md describes the model file.";
 
 /// Writes what the board as designed would have reported.
 #[derive(Args, Clone, Debug)]
