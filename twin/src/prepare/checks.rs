@@ -19,6 +19,8 @@ const OTHER_CELLS: f64 = 1.8;
 /// A jump there and back is one if it is larger than this share of the spread of all, and than so many usual steps.
 const WILD_SHARE: f64 = 0.25;
 const WILD_STEPS: f64 = 20.0;
+/// Readings that may follow each other out there.
+const WILD_ROWS: usize = 3;
 /// More such readings than this share are no longer single ones.
 const WILD_MOST: f64 = 0.02;
 /// A share of the readings at an end of their range that is worth a remark.
@@ -175,44 +177,86 @@ fn thousands(ratio: f64) -> Option<i32> {
     (power != 0.0 && near).then_some(power as i32)
 }
 
-/// Single readings that jump there and back though the reference does not, each with what it would be between its
-/// neighbours. None where the reference has such jumps too, which may only show later, and where they are no longer single.
-pub(super) fn wild(drive: &Drive, observed: &Observed) -> Vec<(usize, f64)> {
-    let rows = || (0..observed.t_s.len()).filter(|row| observed.valid[*row]);
+/// Single readings, or up to [`WILD_ROWS`] in a row, that jump there and back though the reference does not.
+#[derive(Debug, Default)]
+pub(super) struct Wild {
+    /// Their rows.
+    rows: Vec<usize>,
+    /// How often that happens.
+    places: usize,
+    /// What the first would be between its neighbours.
+    between: f64,
+}
+
+/// What is wild. Nothing where the reference has such jumps too, which may only show later, and where there are many.
+pub(super) fn wild(drive: &Drive, observed: &Observed) -> Wild {
+    let count = observed.t_s.len();
+    let rows = || (0..count).filter(|row| observed.valid[*row]);
     let steps = rows().zip(rows().skip(1));
     let steps = steps.map(|(from, to)| (observed.value[to] - observed.value[from]).abs());
     let Some(typical) = median(&mut steps.collect::<Vec<_>>()) else {
-        return Vec::new();
+        return Wild::default();
     };
     let wide = spread(rows().map(|row| observed.value[row]));
     let least = (WILD_SHARE * wide).max(WILD_STEPS * typical);
-    let jump = |[before, now, after]: [f64; 3]| {
-        let back = (now - before) * (now - after) > 0.0;
-        let jump = (now - before).abs().min((now - after).abs());
-        if back { jump } else { 0.0 }
+    let reading = |row: usize| observed.value[row];
+    let reference = |row: usize| reference_at(drive, observed, row);
+    // How far all of the rows between the first and the last one are off both, to one side.
+    let jump = |value: &dyn Fn(usize) -> f64, window: &[usize]| -> f64 {
+        let [first, inside @ .., last] = window else {
+            return 0.0;
+        };
+        let (low, high) = (
+            value(*first).min(value(*last)),
+            value(*first).max(value(*last)),
+        );
+        let over = inside.iter().map(|row| value(*row) - high);
+        let under = inside.iter().map(|row| low - value(*row));
+        over.fold(f64::INFINITY, f64::min)
+            .max(under.fold(f64::INFINITY, f64::min))
     };
-    let mut found = Vec::new();
-    let mut in_reference = 0;
-    let threes = rows().zip(rows().skip(1)).zip(rows().skip(2));
-    for own in threes.map(|((before, now), after)| [before, now, after]) {
-        if observed.segment_of(own[0]) != observed.segment_of(own[2]) {
-            continue;
-        }
-        let readings = own.map(|row| observed.value[row]);
-        let size = jump(readings);
-        if size > least {
-            let references = own.map(|row| reference_at(drive, observed, row));
-            let shown = (references[1] - 0.5 * (references[0] + references[2])).abs();
-            if shown < 0.1 * size {
-                found.push((own[1], 0.5 * (readings[0] + readings[2])));
+    let next = |row: usize| (row + 1..count).find(|row| observed.valid[*row]);
+    let mut found = Wild::default();
+    let mut at = rows().next();
+    while let Some(first) = at {
+        at = next(first);
+        let mut window = vec![first];
+        while let Some(row) = next(*window.last().unwrap_or(&first)) {
+            if observed.segment_of(row) != observed.segment_of(first) {
+                break;
+            }
+            window.push(row);
+            if window.len() < 3 {
+                continue;
+            }
+            if jump(&reference, &window) > least {
+                return Wild::default();
+            }
+            let size = jump(&reading, &window);
+            let (low, high) = window
+                .iter()
+                .map(|row| reference(*row))
+                .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| {
+                    (low.min(x), high.max(x))
+                });
+            if size > least && high - low < 0.1 * size {
+                if found.places == 0 {
+                    found.between = 0.5 * (reading(first) + reading(row));
+                }
+                found.places += 1;
+                found.rows.extend(&window[1..window.len() - 1]);
+                at = Some(row);
+                break;
+            }
+            // Only what already stands out may take longer to come back.
+            let out = (reading(window[1]) - reading(first)).abs() > least;
+            if !out || window.len() == WILD_ROWS + 2 {
+                break;
             }
         }
-        if observed.on_drive_rows && jump(own.map(|row| drive.reference[row])) > least {
-            in_reference += 1;
-        }
     }
-    if in_reference > 0 || found.len() as f64 > WILD_MOST * rows().count() as f64 {
-        return Vec::new();
+    if found.rows.len() as f64 > WILD_MOST * rows().count() as f64 {
+        return Wild::default();
     }
     found
 }
@@ -221,11 +265,11 @@ pub(super) fn wild(drive: &Drive, observed: &Observed) -> Vec<(usize, f64)> {
 fn without<'a>(
     drive: &'a Drive,
     observed: &'a Observed,
-    wild: &'a [(usize, f64)],
+    wild: &'a Wild,
 ) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
     let counted = (0..observed.t_s.len()).filter(|row| observed.valid[*row]);
     counted
-        .filter(|row| wild.binary_search_by_key(row, |(row, _)| *row).is_err())
+        .filter(|row| wild.rows.binary_search(row).is_err())
         .map(|row| (reference_at(drive, observed, row), observed.value[row]))
 }
 
@@ -233,7 +277,7 @@ fn without<'a>(
 pub(super) fn pair(
     drive: &Drive,
     observed: &Observed,
-    wild: &[(usize, f64)],
+    wild: &Wild,
     source: &str,
     [reference, measured]: [&str; 2],
 ) -> Result<(), Failure> {
@@ -271,7 +315,7 @@ pub(super) fn pair(
 pub(super) fn plausible(
     drive: &Drive,
     observed: &Observed,
-    wild: &[(usize, f64)],
+    wild: &Wild,
     sensor: &Sensor,
     [reference, measured]: [&str; 2],
 ) -> Vec<String> {
@@ -304,13 +348,14 @@ pub(super) fn plausible(
         }
     }
     remarks.extend(clipped(pairs, measured));
-    if let Some((row, between)) = wild.first() {
+    if let Some(row) = wild.rows.first() {
         remarks.push(format!(
-            "{measured} jumps there and back within one row in {} that {reference} does not show, the first at {} s: {} \
-             between readings around {between:.4}; such readings may keep anything from fitting",
-            count(wild.len(), "place"),
+            "{measured} jumps there and back within {WILD_ROWS} rows in {} that {reference} does not show, the first at {} s: \
+             {} between readings around {:.4}; such readings may keep anything from fitting",
+            count(wild.places, "place"),
             shown(observed.t_s[*row]),
-            observed.value[*row]
+            observed.value[*row],
+            wild.between
         ));
     }
     remarks.extend(spikes(drive, observed, reference));
