@@ -239,7 +239,7 @@ impl<'a> Work<'a> {
             )));
         }
         let found = self.drive_frame().need(&reference)?;
-        checks::some_values(&found, &reference, self.drive_frame().source())?;
+        checks::some_values(found, &reference, self.drive_frame().source())?;
         let value = self.frame.column(&measured);
         let counter = self.charge_column();
         if value.is_none() && (self.purpose == Purpose::Compare) && counter.is_none() {
@@ -254,13 +254,13 @@ impl<'a> Work<'a> {
         {
             checks::some_values(value, &measured, self.frame.source())?;
             checks::not_constant(value, &measured, self.frame.source())?;
-            checks::not_constant(&found, &reference, self.drive_frame().source())?;
+            checks::not_constant(found, &reference, self.drive_frame().source())?;
         }
         let board = Board::new(sensor.front_end, sensor.average.unwrap_or(1));
         let fresh = match &value {
             Some(value) => freshness(
                 self.frame,
-                &found,
+                found,
                 value,
                 self.reference.is_none(),
                 sensor.interval_s,
@@ -273,8 +273,8 @@ impl<'a> Work<'a> {
                 seconds(interval_s)
             ));
         }
-        self.find_clock(&found, value, &fresh, &measured)?;
-        let parts = series::drive(self.drive_frame(), &found);
+        self.find_clock(found, value, &fresh, &measured)?;
+        let parts = series::drive(self.drive_frame(), found);
         let mut drive = parts.drive;
         self.surroundings(&mut drive, &parts.rows);
         let (observed, rows) = match &value {
@@ -542,7 +542,7 @@ impl<'a> Work<'a> {
             }
             let clock = self.clock.as_ref()?;
             let values = self.frame.column(name)?;
-            series::held_at(clock, &values, &drive.t_s).map(Series::from)
+            series::held_at(clock, values, &drive.t_s).map(Series::from)
         };
         let surroundings = [
             "temp_sensor_c",

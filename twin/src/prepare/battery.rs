@@ -53,13 +53,13 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             .to_string(),
     };
     let found = work.drive_frame().need(&current)?;
-    checks::some_values(&found, &current, work.drive_frame().source())?;
+    checks::some_values(found, &current, work.drive_frame().source())?;
     let every = Freshness::all(work.frame.t_s().len());
     if work.reference.is_some() && work.clock.is_none() {
         let sensed = CURRENTS.iter().find_map(|name| work.frame.column(name));
-        work.find_clock(&found, sensed, &every, "i_meas_a")?;
+        work.find_clock(found, sensed, &every, "i_meas_a")?;
     }
-    let parts = series::drive(work.drive_frame(), &found);
+    let parts = series::drive(work.drive_frame(), found);
     let mut drive = parts.drive;
     work.surroundings(&mut drive, &parts.rows);
     let mut items = Vec::new();
