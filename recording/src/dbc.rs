@@ -3,7 +3,11 @@
 //! A signal becomes the column `<Message>.<Signal>` and its unit's ending, in our unit; signals of this project's own
 //! board get the names of [`name`](crate::name). A value that the database calls "not available" is a missing one.
 
-use std::{collections::HashMap, fs, path::Path};
+use std::{
+    collections::{BTreeSet, HashMap},
+    fs,
+    path::Path,
+};
 
 use can_dbc::{
     ByteOrder, Dbc, DbcError, MessageId, MultiplexIndicator, SignalExtendedValueType,
@@ -11,7 +15,7 @@ use can_dbc::{
 };
 
 use crate::{
-    error::{Error, Kind, Place, Result, quoted},
+    error::{Error, Kind, Place, Result, listed, quoted},
     log::{DATA_BYTES, Frame},
     merge::{Series, Signal},
     unit::{self, Scale, Unit},
@@ -372,6 +376,9 @@ pub struct Decoder<'a> {
     source: String,
     /// Frames of other buses are left out.
     bus: Option<String>,
+    /// Whether it had any frame, and the buses of those left out.
+    met: bool,
+    others: BTreeSet<String>,
     zero_ns: Option<i64>,
     latest_ns: i64,
     counts: Decoded,
@@ -400,6 +407,8 @@ impl<'a> Decoder<'a> {
             database,
             source: source.to_owned(),
             bus: bus.map(str::to_owned),
+            met: false,
+            others: BTreeSet::new(),
             zero_ns: (!from_first_frame).then_some(0),
             latest_ns: i64::MIN,
             counts: Decoded::default(),
@@ -431,8 +440,12 @@ impl<'a> Decoder<'a> {
         }
         self.latest_ns = self.latest_ns.max(time_ns);
         if self.bus.as_ref().is_some_and(|bus| bus != frame.bus) {
+            if !self.others.contains(frame.bus) {
+                self.others.insert(frame.bus.to_owned());
+            }
             return Ok(());
         }
+        self.met = true;
         let id = if frame.extended {
             MessageId::Extended(frame.id)
         } else {
@@ -479,6 +492,24 @@ impl<'a> Decoder<'a> {
         }
         self.counts.short += u64::from(short);
         Ok(())
+    }
+
+    /// The bus that was chosen had frames, if any had.
+    pub fn check_bus(&self) -> Result<()> {
+        let Some(bus) = self.bus.as_ref().filter(|_| !self.met) else {
+            return Ok(());
+        };
+        if self.others.is_empty() {
+            return Ok(());
+        }
+        let others: Vec<&str> = self.others.iter().map(String::as_str).collect();
+        Err(Error::new(
+            Kind::Empty,
+            self.source.as_str(),
+            Place::default(),
+            format!("frames on the buses {}", listed(others.into_iter())),
+            format!("some on {}", quoted(bus)),
+        ))
     }
 
     /// The signals, a series for each message that was received, and what else there was.

@@ -9,7 +9,7 @@ use recording::{
     dbc::Database,
 };
 
-use crate::{failure::Failure, progress::Progress};
+use crate::{failure::Failure, overwrite, progress::Progress};
 
 /// What an example of its use looks like.
 const EXAMPLE: &str = "\
@@ -43,6 +43,9 @@ pub struct Arguments {
 
 /// Converts, and says in a few lines what became of it.
 pub fn run(arguments: &Arguments) -> Result<String, Failure> {
+    let database = arguments.dbc.as_deref().map(|path| ("--dbc", path));
+    let read = [("IN", arguments.input.as_path())];
+    overwrite::refuse(&arguments.out, read.into_iter().chain(database))?;
     let options = Options {
         database: arguments.dbc.as_deref().map(Database::read).transpose()?,
         bus: arguments.bus.clone(),

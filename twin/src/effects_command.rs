@@ -35,7 +35,7 @@ struct Row {
 struct Parameter {
     name: &'static str,
     unit: &'static str,
-    /// `null` stands for infinity.
+    /// `null` stands for infinity, and for the value that the model file states.
     off: f64,
 }
 
@@ -92,6 +92,7 @@ pub fn run(arguments: &Arguments) -> String {
                 let off = match parameter.off {
                     off if off == f64::INFINITY => "∞".to_owned(),
                     off if off == f64::NEG_INFINITY => "−∞".to_owned(),
+                    off if off.is_nan() => "as the model file states".to_owned(),
                     off => off.to_string(),
                 };
                 format!("{}{unit} (off: {off})", parameter.name)

@@ -3,6 +3,7 @@
 mod calibration;
 
 use std::{
+    collections::HashSet,
     fs,
     io::Write,
     path::{Path, PathBuf},
@@ -15,10 +16,12 @@ use crate::{
     explain::{self, Holdout, Options},
     failure::Failure,
     model::{Found, Model, Shift, registry},
-    prepare::{Inputs, Purpose, prepare},
+    overwrite,
+    prepare::{Inputs, Item, Prepared, Purpose, prepare},
     progress::Progress,
     report::{
         data::{self, Report},
+        format::quantity,
         html, json, text,
     },
 };
@@ -31,6 +34,15 @@ Example:
 Writes report/report.json, report/report.html (one file, no network) and report/model.toml, the model file with the
 physics that was found; report/calibration.toml where the board can correct it. docs/model-file.md describes the model
 file, `twin effects` lists the physics that is looked for.";
+/// What is written; the last only where the board can correct something.
+const FILES: [&str; 4] = [
+    "report.json",
+    "report.html",
+    "model.toml",
+    "calibration.toml",
+];
+/// A hold-out of which more of the changes are found in the fitted recording is a copy of it.
+const COPIED: f64 = 0.9;
 /// Width of the summary where the terminal does not tell its own.
 const WIDTH: usize = 100;
 
@@ -81,7 +93,21 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             out.display()
         )));
     }
+    let refuse = |file: Option<(&str, &Path)>| {
+        let mut written = FILES.iter().map(|name| out.join(name));
+        written.try_for_each(|written| overwrite::refuse(&written, file))
+    };
+    let read = [
+        ("--model", &arguments.model),
+        ("--recording", &arguments.recording),
+    ];
+    let reference = arguments.reference.iter().map(|path| ("--reference", path));
+    let holdout = arguments.holdout.iter().map(|path| ("--holdout", path));
+    for (argument, path) in read.into_iter().chain(reference).chain(holdout) {
+        refuse(Some((argument, path)))?;
+    }
     let model = Model::read(&arguments.model)?;
+    refuse(model.ocv_file())?;
     let reading = Progress::new(format!("reading {}", arguments.recording.display()));
     let inputs = Inputs {
         recording: arguments.recording.clone(),
@@ -98,6 +124,13 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             mapping: arguments.map.clone(),
         };
         let other = prepare(&model, &inputs, Purpose::Compare)?;
+        if let Some(signal) = copied(&prepared, &other) {
+            return Err(Failure::Input(format!(
+                "{}, column {signal}: found the readings of {}, expected another recording: a hold-out is never fitted",
+                file.display(),
+                arguments.recording.display()
+            )));
+        }
         remarks.extend(
             other
                 .remarks
@@ -122,6 +155,7 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     drop(explaining);
     remarks.append(&mut report.remarks);
     report.remarks = remarks;
+    report.name_values();
     report.inputs = data::Inputs {
         model: arguments.model.display().to_string(),
         recording: arguments.recording.display().to_string(),
@@ -129,18 +163,20 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             .reference
             .as_ref()
             .map(|path| path.display().to_string()),
+        without: arguments.without.clone(),
         out: Some(out.display().to_string()),
     };
     let calibration = calibration::calibrate(&model, &report);
     report.remarks.extend(calibration.remarks);
     let extended = extended(&model, &report, &arguments.model, out)?;
+    let [json, page, model, registers] = FILES;
     let mut files = vec![
-        ("report.json", json::render(&report)),
-        ("report.html", html::render(&report)),
-        ("model.toml", extended),
+        (json, json::render(&report)),
+        (page, html::render(&report)),
+        (model, extended),
     ];
     if let Some(text) = calibration.text {
-        files.push(("calibration.toml", text));
+        files.push((registers, text));
     }
     write(out, &files)?;
     let width = std::env::var("COLUMNS")
@@ -149,6 +185,33 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     Ok(text::render(&report, width.unwrap_or(WIDTH))
         .trim_end()
         .to_owned())
+}
+
+/// The first signal of a hold-out whose readings are those of the fitted recording, at the same times of their own clocks.
+/// Only those that differ from the one before are looked at: at rest two recordings may read the same.
+fn copied(fitted: &Prepared, other: &Prepared) -> Option<String> {
+    let changes = |prepared: &Prepared, item: &Item| -> Vec<(u64, u64)> {
+        let observed = &item.problem.observed;
+        let mut last = f64::NAN;
+        let mut changes = Vec::new();
+        for row in (0..observed.value.len()).filter(|row| observed.valid[*row]) {
+            let (value, own) = (observed.value[row], item.rows.get(row).copied());
+            let t_s = own.and_then(|row| prepared.t_s.get(row).copied());
+            if let Some(t_s) = t_s.filter(|_| value != last) {
+                changes.push((t_s.to_bits(), value.to_bits()));
+            }
+            last = value;
+        }
+        changes
+    };
+    other.items.iter().find_map(|item| {
+        let name = &item.problem.name;
+        let same = fitted.items.iter().find(|one| one.problem.name == *name)?;
+        let known: HashSet<(u64, u64)> = changes(fitted, same).into_iter().collect();
+        let found = changes(other, item);
+        let shared = found.iter().filter(|change| known.contains(change)).count();
+        (shared as f64 > COPIED * found.len() as f64).then(|| name.clone())
+    })
 }
 
 /// All files, or none.
@@ -214,8 +277,10 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
             ];
             for parameter in &said.parameters {
                 comment.push(format!(
-                    "{}: 95 % interval {} to {} {}",
-                    parameter.name, parameter.ci95[0], parameter.ci95[1], parameter.unit
+                    "{}: 95 % interval {} to {}",
+                    parameter.name,
+                    parameter.ci95[0],
+                    quantity(&parameter.ci95[1].to_string(), &parameter.unit)
                 ));
             }
             found.push(Found {

@@ -125,6 +125,8 @@ pub struct Battery {
     pub resistance_uncertainty: f64,
     /// Open-circuit voltage of one cell: state of charge (ascending) and V; empty if not stated.
     pub ocv: Vec<(f64, f64)>,
+    /// The file that it is from, if it is from one.
+    pub ocv_file: Option<PathBuf>,
     /// State of charge at the start, 0 … 1, if known.
     pub initial_soc: Option<f64>,
     /// Its standard uncertainty.
@@ -283,6 +285,12 @@ impl Model {
             effects,
             text,
         })
+    }
+
+    /// The file of voltages that it was read with, and the key that names it.
+    pub fn ocv_file(&self) -> Option<(&str, &Path)> {
+        let file = self.battery.as_ref()?.ocv_file.as_deref()?;
+        Some(("ocv_file", file))
     }
 
     /// As written.
@@ -484,7 +492,8 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         text.cells >= 1,
         "one or more cells in series",
     )?;
-    let ocv = match (text.ocv.is_empty(), &text.ocv_file) {
+    let ocv_file = text.ocv_file.as_ref().map(|file| folder.join(file));
+    let ocv = match (text.ocv.is_empty(), &ocv_file) {
         (false, Some(_)) => {
             return Err(places.fault(
                 &["battery", "ocv_file"],
@@ -498,7 +507,7 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
             })?;
             text.ocv
         }
-        (true, Some(file)) => read_ocv(&folder.join(file))?,
+        (true, Some(file)) => read_ocv(file)?,
     };
     Ok(Battery {
         capacity_ah: capacity,
@@ -506,6 +515,7 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         resistance_ohm: text.ohmic_resistance_ohm,
         resistance_uncertainty: text.resistance_uncertainty,
         ocv,
+        ocv_file,
         initial_soc: text.initial_soc,
         initial_soc_uncertainty: text.initial_soc_uncertainty,
         cells: text.cells,

@@ -141,6 +141,9 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
     if items.is_empty() {
         return Err(nothing_to_compare(model, &frame));
     }
+    if purpose == Purpose::Compare {
+        work.not_compared(&items);
+    }
     for item in &mut items {
         model_effects(model, item);
         if purpose == Purpose::Compare {
@@ -198,11 +201,45 @@ impl<'a> Work<'a> {
         }
     }
 
+    /// Says what the model file states and the recording has no column for.
+    fn not_compared(&mut self, items: &[Item]) {
+        let has = |view| items.iter().any(|item| item.problem.view == view);
+        let model = self.model;
+        if let Some(sensor) = model.sensor.as_ref().filter(|_| !has(View::Sensor))
+            && let Ok((_, measured)) = self.names(sensor)
+        {
+            self.remark(format!(
+                "[sensor]'s readings are not compared: no column {measured} in {}",
+                self.frame.source()
+            ));
+        }
+        if let Some(charge) = model.charge.as_ref().filter(|_| !has(View::Charge)) {
+            self.remark(format!(
+                "[charge] is not compared: no column {} in {}",
+                charge.column.as_deref().unwrap_or("q_meas_c"),
+                self.frame.source()
+            ));
+        }
+        if let Some(battery) = &model.battery {
+            battery::not_compared(self, battery, items);
+        }
+    }
+
     /// The sensor, and its charge counter.
     fn sensor(&mut self, sensor: &Sensor) -> Result<Vec<Item>, Failure> {
         let (reference, measured) = self.names(sensor)?;
+        let column = self.frame.origin(&measured);
+        if self.purpose == Purpose::Compare
+            && self.reference.is_none()
+            && self.frame.origin(&reference) == column
+        {
+            return Err(Failure::Input(format!(
+                "{}: found the column {column} as the sensor's reference and as its reading, expected two columns",
+                self.frame.source()
+            )));
+        }
         let found = self.drive_frame().need(&reference)?;
-        checks::some_values(&found, &reference, self.drive_frame().source())?;
+        checks::some_values(found, &reference, self.drive_frame().source())?;
         let value = self.frame.column(&measured);
         let counter = self.charge_column();
         if value.is_none() && (self.purpose == Purpose::Compare) && counter.is_none() {
@@ -217,13 +254,13 @@ impl<'a> Work<'a> {
         {
             checks::some_values(value, &measured, self.frame.source())?;
             checks::not_constant(value, &measured, self.frame.source())?;
-            checks::not_constant(&found, &reference, self.drive_frame().source())?;
+            checks::not_constant(found, &reference, self.drive_frame().source())?;
         }
         let board = Board::new(sensor.front_end, sensor.average.unwrap_or(1));
         let fresh = match &value {
             Some(value) => freshness(
                 self.frame,
-                &found,
+                found,
                 value,
                 self.reference.is_none(),
                 sensor.interval_s,
@@ -236,8 +273,8 @@ impl<'a> Work<'a> {
                 seconds(interval_s)
             ));
         }
-        self.find_clock(&found, value, &fresh, &measured)?;
-        let parts = series::drive(self.drive_frame(), &found);
+        self.find_clock(found, value, &fresh, &measured)?;
+        let parts = series::drive(self.drive_frame(), found);
         let mut drive = parts.drive;
         self.surroundings(&mut drive, &parts.rows);
         let (observed, rows) = match &value {
@@ -245,9 +282,11 @@ impl<'a> Work<'a> {
             None => (series::every_row(&drive), Arc::clone(&parts.rows)),
         };
         if self.purpose == Purpose::Compare && value.is_some() {
+            let wild = checks::wild(&drive, &observed);
+            let names = [reference.as_str(), measured.as_str()];
             let (errors, remarks) = (
-                checks::pair(&drive, &observed, &reference, &measured),
-                checks::plausible(&drive, &observed, sensor, &reference, &measured),
+                checks::pair(&drive, &observed, &wild, self.frame.source(), names),
+                checks::plausible(&drive, &observed, &wild, sensor, names),
             );
             for remark in remarks {
                 self.remark(remark);
@@ -503,7 +542,7 @@ impl<'a> Work<'a> {
             }
             let clock = self.clock.as_ref()?;
             let values = self.frame.column(name)?;
-            series::held_at(clock, &values, &drive.t_s).map(Series::from)
+            series::held_at(clock, values, &drive.t_s).map(Series::from)
         };
         let surroundings = [
             "temp_sensor_c",

@@ -78,7 +78,13 @@ fn two_units() {
         });
     says(
         &explained(PAIR, &recording),
-        &["i_ref_a", "i_meas_a", "factor near 1000", "same unit"],
+        &[
+            "r.csv: ",
+            "i_ref_a",
+            "i_meas_a",
+            "factor near 1000",
+            "same unit",
+        ],
     );
     let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
         + &rows(300, |t| format!("{t},{},{}", current(t), 1e6 * current(t)));
@@ -93,7 +99,7 @@ fn opposite_signs() {
     says(
         &sentence,
         &[
-            "i_meas_a falls where i_ref_a rises",
+            "r.csv: i_meas_a falls where i_ref_a rises",
             "--map i_meas_a=-i_meas_a",
         ],
     );
@@ -227,19 +233,22 @@ fn a_battery_in_other_units_or_signs() {
     };
     says(
         &explained(battery, &recording(&|i| 3700.0 - 100.0 * i)),
-        &["v_cell_v", "10^3", "expected V"],
+        &["r.csv, column v_cell_v", "10^3", "expected V"],
     );
     let sentence = explained(battery, &recording(&|i| 3.7 + 0.1 * i));
     says(
         &sentence,
         &[
-            "v_cell_v rises where i_ref_a rises",
+            "r.csv: v_cell_v rises where i_ref_a rises",
             "--map i_ref_a=-i_ref_a",
         ],
     );
     let recording = "t_s,i_ref_a,soc_pct\n".to_owned()
         + &rows(300, |t| format!("{t},{},{}", current(t), 0.9 - 1e-3 * t));
-    says(&explained(battery, &recording), &["soc_pct", "per cent"]);
+    says(
+        &explained(battery, &recording),
+        &["r.csv, column soc_pct", "per cent"],
+    );
 }
 
 #[test]
@@ -331,4 +340,187 @@ fn an_implausible_reference_is_said_to_be_one() {
     let mut written = names(&folder.path().join("out"));
     written.sort();
     assert_eq!(written, ["model.toml", "report.html", "report.json"]);
+}
+
+/// The report of a run that goes well.
+fn report(files: &[(&str, &str)], arguments: &[&str]) -> serde_json::Value {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, content) in files {
+        fs::write(folder.path().join(name), content).unwrap();
+    }
+    let output = Command::new(env!("CARGO_BIN_EXE_twin"))
+        .args(["explain", "--model", "m.toml", "--recording", "r.csv"])
+        .args(["--out", "out"])
+        .args(arguments)
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(0), "{output:?}");
+    let report = fs::read_to_string(folder.path().join("out/report.json")).unwrap();
+    serde_json::from_str(&report).unwrap()
+}
+
+#[test]
+fn a_file_that_is_read_is_not_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    fs::create_dir(path("out")).unwrap();
+    let files = [
+        ("out/model.toml", PAIR.to_owned()),
+        ("out/report.json", good()),
+        ("r.csv", good()),
+        (
+            "b.toml",
+            "schema = 1\n[battery]\ncapacity_ah = 2\nocv_file = \"ocv.csv\"\n".to_owned(),
+        ),
+        ("ocv.csv", "soc,ocv_v\n0,3\n1,4\n".to_owned()),
+    ];
+    for (name, content) in &files {
+        fs::write(path(name), content).unwrap();
+    }
+    #[cfg(unix)]
+    std::os::unix::fs::symlink("r.csv", path("link.csv")).unwrap();
+    #[cfg(not(unix))]
+    fs::write(path("link.csv"), good()).unwrap();
+    let simulate = ["simulate", "--model", "out/model.toml", "--recording"];
+    let explain = ["explain", "--out", "out", "--recording", "r.csv", "--model"];
+    let cases: [(&[&str], &[&str], &str); 6] = [
+        (
+            &simulate,
+            &["r.csv", "--out", "./out/../r.csv"],
+            "--recording",
+        ),
+        (&simulate, &["link.csv", "--out", "r.csv"], "--recording"),
+        (
+            &["simulate", "--model", "b.toml"],
+            &["--recording", "r.csv", "--out", "ocv.csv"],
+            "ocv_file",
+        ),
+        (&["convert", "r.csv"], &["--out", "r.csv"], "IN"),
+        (&explain, &["out/model.toml"], "--model"),
+        (
+            &explain,
+            &["b.toml", "--holdout", "out/report.json"],
+            "--holdout",
+        ),
+    ];
+    for (first, rest, argument) in cases {
+        let output = Command::new(env!("CARGO_BIN_EXE_twin"))
+            .args(first)
+            .args(rest)
+            .current_dir(folder.path())
+            .output()
+            .unwrap();
+        let sentence = String::from_utf8(output.stderr).unwrap();
+        if cfg!(unix) || !first.contains(&"link.csv") {
+            assert_eq!(output.status.code(), Some(2), "{rest:?} {sentence}");
+            says(&sentence, &["found the file that is read as", argument]);
+        }
+        for (name, content) in &files {
+            assert_eq!(fs::read_to_string(path(name)).unwrap(), *content, "{name}");
+        }
+    }
+}
+
+#[test]
+fn a_hold_out_that_was_fitted() {
+    let files = [("m.toml", PAIR), ("r.csv", &good()), ("copy.csv", &good())];
+    let arguments = ["explain", "--model", "m.toml", "--recording", "r.csv"];
+    let holdout = ["--out", "out", "--holdout", "copy.csv"];
+    says(
+        &refused(&files, &[&arguments[..], &holdout].concat()),
+        &[
+            "copy.csv, column i_meas_a",
+            "readings of r.csv",
+            "never fitted",
+        ],
+    );
+    // Of the same drive, read anew.
+    let other = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| format!("{t},{},{}", current(t), current(t) + 0.51));
+    let files = [("m.toml", PAIR), ("r.csv", &good()), ("copy.csv", &other)];
+    report(&files, &["--holdout", "copy.csv"]);
+}
+
+#[test]
+fn a_column_compared_with_itself() {
+    let model = "schema = 1\n[sensor]\nreference = \"i_ref_a\"\nmeasured = \"i_ref_a\"\n";
+    says(
+        &explained(model, &good()),
+        &["r.csv", "i_ref_a", "expected two columns"],
+    );
+    let model =
+        "schema = 1\n[columns]\ni_ref_a = \"i_meas_a\"\ni_meas_a = \"-i_meas_a\"\n[sensor]\n";
+    says(
+        &explained(model, &good()),
+        &["r.csv", "i_meas_a", "expected two columns"],
+    );
+}
+
+#[test]
+fn what_is_not_compared_is_said() {
+    let model =
+        "schema = 1\n[sensor]\n[charge]\n[battery]\ncapacity_ah = 2\nocv = [[0, 3.0], [1, 4.0]]\n";
+    let said = report(&[("m.toml", model), ("r.csv", &good())], &[]);
+    says(
+        &said["remarks"].to_string(),
+        &[
+            "[charge] is not compared: no column q_meas_c in r.csv",
+            "[battery] is not compared: no column soc_pct, v_cell_v or v_pack_v in r.csv",
+        ],
+    );
+    let said = report(&[("m.toml", PAIR), ("r.csv", &good())], &[]);
+    assert_eq!(said["remarks"].to_string(), "[]");
+}
+
+#[test]
+fn a_pack_beside_one_cell() {
+    let recording = |name: &str| {
+        format!("t_s,i_ref_a,{name}\n")
+            + &rows(300, |t| {
+                format!("{t},{},{}", current(t), 96.0 * (3.7 - 0.01 * current(t)))
+            })
+    };
+    let battery = "schema = 1\n[battery]\ncapacity_ah = 2\nocv = [[0, 3.0], [1, 4.0]]\n";
+    says(
+        &explained(battery, &recording("v_cell_v")),
+        &[
+            "r.csv, column v_cell_v",
+            "3.0000 … 4.0000 V",
+            "v_pack_v, with cells",
+        ],
+    );
+    says(
+        &explained(battery, &recording("v_pack_v")),
+        &["r.csv, column v_pack_v", "cells = 1 in [battery]"],
+    );
+    // Beyond the table, but one cell.
+    let battery = format!("{battery}cells = 96\nohmic_resistance_ohm = 0.01\n");
+    report(
+        &[("m.toml", &battery), ("r.csv", &recording("v_pack_v"))],
+        &[],
+    );
+}
+
+#[test]
+fn single_readings_that_are_wild_are_said() {
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(400, |t| {
+            let reading = match (t * 10.0).round() as i32 {
+                77 => 1e6,
+                200..=202 => -3e5,
+                _ => current(t),
+            };
+            format!("{t},{},{reading}", current(t))
+        });
+    let said = report(&[("m.toml", PAIR), ("r.csv", &recording)], &[]);
+    let remarks = said["remarks"].to_string();
+    says(
+        &remarks,
+        &[
+            "i_meas_a jumps there and back within 3 rows in 2 places",
+            "the first at 7.7 s: 1000000",
+        ],
+    );
+    assert!(!remarks.contains("another conductor"), "{remarks}");
 }

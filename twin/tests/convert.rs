@@ -136,7 +136,7 @@ fn bad_input_ends_with_2_and_leaves_nothing() {
         ),
         (
             &["drive.log", "--dbc", "v.dbc", "--bus", "can7"],
-            "drive.log: found no values, expected at least one signal that the database describes",
+            "drive.log: found frames on the buses can0, expected some on \"can7\"",
         ),
     ];
     for (arguments, sentence) in cases {

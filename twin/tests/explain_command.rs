@@ -177,6 +177,7 @@ fn lists_the_library() {
     for id in ids {
         assert!(table.lines().any(|line| line == id), "{id}");
     }
+    assert!(!table.contains("NaN"), "{table}");
 }
 
 #[test]
@@ -187,4 +188,59 @@ fn every_command_has_an_example() {
         let help = String::from_utf8(output.stdout).unwrap();
         assert!(help.contains(&format!("  twin {command}")), "{help}");
     }
+}
+
+/// The library is written for currents; of watts nothing is to be said in amperes. What was taken out is in the report.
+#[test]
+fn a_power_sensor_in_its_own_words() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let mut text = "t_s,p_ref_w,p_meas_w\n".to_owned();
+    for k in 0..1500 {
+        let t_s = f64::from(k) * 0.1;
+        let power = 200.0 + 100.0 * (0.37 * t_s).sin() + 60.0 * (1.91 * t_s).sin();
+        let jitter = 0.3 * (f64::from(k * k % 1009) / 1009.0 - 0.5);
+        text.push_str(&format!("{t_s},{power},{}\n", 1.015 * power + jitter));
+    }
+    fs::write(folder.join("r.csv"), text).unwrap();
+    fs::write(
+        folder.join("m.toml"),
+        "schema = 1\n[sensor]\nnoise = 0.09\n",
+    )
+    .unwrap();
+    let arguments = [
+        "explain",
+        "--model",
+        "m.toml",
+        "--recording",
+        "r.csv",
+        "--out",
+        "out",
+        "--without",
+        "hum",
+    ];
+    let output = twin(folder, &arguments);
+    let summary = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{summary}");
+    assert!(
+        summary.contains("Taken out of the library: hum"),
+        "{summary}"
+    );
+    let read = |name: &str| fs::read_to_string(folder.join("out").join(name)).unwrap();
+    let (report, page, model) = (read("report.json"), read("report.html"), read("model.toml"));
+    assert!(page.contains("<dt>Taken out of the library</dt><dd>hum</dd>"));
+    let said: serde_json::Value = serde_json::from_str(&report).unwrap();
+    assert_eq!(said["inputs"]["without"][0], "hum");
+    assert_eq!(said["effects"][0]["id"], "gain", "{summary}");
+    assert!(
+        report.contains("abs(x)") && !report.contains("abs(i)"),
+        "{report}"
+    );
+    assert!(model.contains("reads every value too large"), "{model}");
+    let interval = model
+        .lines()
+        .find(|line| line.contains("gain: 95 %"))
+        .unwrap();
+    let end = interval.rsplit(' ').next().unwrap();
+    assert!(end.starts_with("1.01"), "{interval}");
 }

@@ -13,7 +13,7 @@ use crate::{
 
 /// Columns of a voltage.
 const CELL: &str = "v_cell_v";
-const PACK: &str = "v_pack_v";
+pub(super) const PACK: &str = "v_pack_v";
 const SOC: &str = "soc_pct";
 /// Columns of the current, in the order in which they are looked for.
 const CURRENTS: [&str; 2] = ["i_ref_a", "i_meas_a"];
@@ -53,13 +53,13 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             .to_string(),
     };
     let found = work.drive_frame().need(&current)?;
-    checks::some_values(&found, &current, work.drive_frame().source())?;
+    checks::some_values(found, &current, work.drive_frame().source())?;
     let every = Freshness::all(work.frame.t_s().len());
     if work.reference.is_some() && work.clock.is_none() {
         let sensed = CURRENTS.iter().find_map(|name| work.frame.column(name));
-        work.find_clock(&found, sensed, &every, "i_meas_a")?;
+        work.find_clock(found, sensed, &every, "i_meas_a")?;
     }
-    let parts = series::drive(work.drive_frame(), &found);
+    let parts = series::drive(work.drive_frame(), found);
     let mut drive = parts.drive;
     work.surroundings(&mut drive, &parts.rows);
     let mut items = Vec::new();
@@ -96,7 +96,8 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             resistance_sigma: battery.resistance_uncertainty,
         };
         if work.purpose == Purpose::Compare {
-            checks::battery(view, &drive, &observed, &base, name, &current)?;
+            let source = work.frame.source();
+            checks::battery(view, &drive, &observed, &base, [source, name, &current])?;
         }
         start(
             work,
@@ -143,6 +144,28 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
         });
     }
     Ok(items)
+}
+
+/// What of the battery is there and yet not compared.
+pub(super) fn not_compared(work: &mut Work<'_>, battery: &Battery, items: &[Item]) {
+    let has = |view| items.iter().any(|item| item.problem.view == view);
+    let voltages = [CELL, PACK].map(|name| work.frame.has(name).then_some(name));
+    let voltage = voltages.into_iter().flatten().next();
+    if let Some(name) = voltage.filter(|_| battery.ocv.is_empty()) {
+        work.remark(format!(
+            "{name} is not compared: [battery] states neither ocv nor ocv_file"
+        ));
+    } else if !has(View::StateOfCharge) && !has(View::Voltage) {
+        let wanted = if battery.ocv.is_empty() {
+            SOC.to_owned()
+        } else {
+            format!("{SOC}, {CELL} or {PACK}")
+        };
+        work.remark(format!(
+            "[battery] is not compared: no column {wanted} in {}",
+            work.frame.source()
+        ));
+    }
 }
 
 /// State of charge at the start of each segment.

@@ -35,18 +35,18 @@ pub(super) fn item(
     if known < FEWEST_ROWS && work.purpose == Purpose::Simulate {
         return Ok(None);
     }
-    checks::some_values(&value, column, work.frame.source())?;
+    checks::some_values(value, column, work.frame.source())?;
     let spec = work.model.charge.clone().unwrap_or_default();
     let step_c = board.map_or(spec.step_c, Board::charge_step_c);
     let every = vec![true; value.len()];
     let (mut readings, rows) = match &work.clock {
-        Some(clock) => series::own_rows(drive, clocks, work.frame.clocks(), clock, &value, &every),
+        Some(clock) => series::own_rows(drive, clocks, work.frame.clocks(), clock, value, &every),
         None => series::own_rows(
             drive,
             clocks,
             work.frame.clocks(),
             work.frame.t_s(),
-            &value,
+            value,
             &every,
         ),
     };

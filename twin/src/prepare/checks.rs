@@ -1,10 +1,11 @@
 //! What cannot be explained because the input is not what it is said to be: each its own clear error.
 
-use super::{FEWEST_ROWS, seconds, series::median};
+use super::{FEWEST_ROWS, battery::PACK, seconds, series::median};
 use crate::{
     failure::Failure,
     model::Sensor,
     problem::{BatteryBase, Drive, Observed, Problem, View},
+    report::format::count,
 };
 
 /// A ratio of two spreads is a power of 1000 if it is within this factor of one.
@@ -13,6 +14,15 @@ const POWER_WITHIN: f64 = 2.0;
 const OPPOSITE: f64 = -0.5;
 /// Below this magnitude of correlation the two have nothing in common.
 const UNRELATED: f64 = 0.1;
+/// A voltage further than this beyond the table's ends, as a factor, is not that of so many cells.
+const OTHER_CELLS: f64 = 1.8;
+/// A jump there and back is one if it is larger than this share of the spread of all, and than so many usual steps.
+const WILD_SHARE: f64 = 0.25;
+const WILD_STEPS: f64 = 20.0;
+/// Readings that may follow each other out there.
+const WILD_ROWS: usize = 3;
+/// More such readings than this share are no longer single ones.
+const WILD_MOST: f64 = 0.02;
 /// A share of the readings at an end of their range that is worth a remark.
 const CLIPPED_SHARE: f64 = 0.005;
 
@@ -87,14 +97,16 @@ fn beside<'a>(
     observed: &'a Observed,
 ) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
     let counted = (0..observed.t_s.len()).filter(|row| observed.valid[*row]);
-    counted.map(|row| {
-        let reference = if observed.on_drive_rows {
-            drive.reference[row]
-        } else {
-            at(drive, observed.segment_of(row), observed.t_s[row])
-        };
-        (reference, observed.value[row])
-    })
+    counted.map(|row| (reference_at(drive, observed, row), observed.value[row]))
+}
+
+/// The reference at a reading.
+fn reference_at(drive: &Drive, observed: &Observed, row: usize) -> f64 {
+    if observed.on_drive_rows {
+        drive.reference[row]
+    } else {
+        at(drive, observed.segment_of(row), observed.t_s[row])
+    }
 }
 
 fn at(drive: &Drive, segment: usize, t_s: f64) -> f64 {
@@ -165,14 +177,111 @@ fn thousands(ratio: f64) -> Option<i32> {
     (power != 0.0 && near).then_some(power as i32)
 }
 
+/// Single readings, or up to [`WILD_ROWS`] in a row, that jump there and back though the reference does not.
+#[derive(Debug, Default)]
+pub(super) struct Wild {
+    /// Their rows.
+    rows: Vec<usize>,
+    /// How often that happens.
+    places: usize,
+    /// What the first would be between its neighbours.
+    between: f64,
+}
+
+/// What is wild. Nothing where the reference has such jumps too, which may only show later, and where there are many.
+pub(super) fn wild(drive: &Drive, observed: &Observed) -> Wild {
+    let count = observed.t_s.len();
+    let rows = || (0..count).filter(|row| observed.valid[*row]);
+    let steps = rows().zip(rows().skip(1));
+    let steps = steps.map(|(from, to)| (observed.value[to] - observed.value[from]).abs());
+    let Some(typical) = median(&mut steps.collect::<Vec<_>>()) else {
+        return Wild::default();
+    };
+    let wide = spread(rows().map(|row| observed.value[row]));
+    let least = (WILD_SHARE * wide).max(WILD_STEPS * typical);
+    let reading = |row: usize| observed.value[row];
+    let reference = |row: usize| reference_at(drive, observed, row);
+    // How far all of the rows between the first and the last one are off both, to one side.
+    let jump = |value: &dyn Fn(usize) -> f64, window: &[usize]| -> f64 {
+        let [first, inside @ .., last] = window else {
+            return 0.0;
+        };
+        let (low, high) = (
+            value(*first).min(value(*last)),
+            value(*first).max(value(*last)),
+        );
+        let over = inside.iter().map(|row| value(*row) - high);
+        let under = inside.iter().map(|row| low - value(*row));
+        over.fold(f64::INFINITY, f64::min)
+            .max(under.fold(f64::INFINITY, f64::min))
+    };
+    let next = |row: usize| (row + 1..count).find(|row| observed.valid[*row]);
+    let mut found = Wild::default();
+    let mut at = rows().next();
+    while let Some(first) = at {
+        at = next(first);
+        let mut window = vec![first];
+        while let Some(row) = next(*window.last().unwrap_or(&first)) {
+            if observed.segment_of(row) != observed.segment_of(first) {
+                break;
+            }
+            window.push(row);
+            if window.len() < 3 {
+                continue;
+            }
+            if jump(&reference, &window) > least {
+                return Wild::default();
+            }
+            let size = jump(&reading, &window);
+            let (low, high) = window
+                .iter()
+                .map(|row| reference(*row))
+                .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| {
+                    (low.min(x), high.max(x))
+                });
+            if size > least && high - low < 0.1 * size {
+                if found.places == 0 {
+                    found.between = 0.5 * (reading(first) + reading(row));
+                }
+                found.places += 1;
+                found.rows.extend(&window[1..window.len() - 1]);
+                at = Some(row);
+                break;
+            }
+            // Only what already stands out may take longer to come back.
+            let out = (reading(window[1]) - reading(first)).abs() > least;
+            if !out || window.len() == WILD_ROWS + 2 {
+                break;
+            }
+        }
+    }
+    if found.rows.len() as f64 > WILD_MOST * rows().count() as f64 {
+        return Wild::default();
+    }
+    found
+}
+
+/// The pairs without the wild readings.
+fn without<'a>(
+    drive: &'a Drive,
+    observed: &'a Observed,
+    wild: &'a Wild,
+) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
+    let counted = (0..observed.t_s.len()).filter(|row| observed.valid[*row]);
+    counted
+        .filter(|row| wild.rows.binary_search(row).is_err())
+        .map(|row| (reference_at(drive, observed, row), observed.value[row]))
+}
+
 /// Units and signs of a sensor and its reference.
 pub(super) fn pair(
     drive: &Drive,
     observed: &Observed,
-    reference: &str,
-    measured: &str,
+    wild: &Wild,
+    source: &str,
+    [reference, measured]: [&str; 2],
 ) -> Result<(), Failure> {
-    let pairs = beside(drive, observed);
+    let pairs = without(drive, observed, wild);
     if pairs.clone().count() < FEWEST_ROWS {
         return Ok(());
     }
@@ -186,7 +295,7 @@ pub(super) fn pair(
         };
         let factor = 1000_f64.powi(power.abs());
         return Err(Failure::Input(format!(
-            "{large} moves by {:.4} and {small} by {:.4}, a factor near {factor}: found two units, expected the same \
+            "{source}: {large} moves by {:.4} and {small} by {:.4}, a factor near {factor}: found two units, expected the same \
              unit in both (one of them may be in thousandths)",
             spread_x.max(spread_y),
             spread_x.min(spread_y)
@@ -195,7 +304,7 @@ pub(super) fn pair(
     let together = correlation(pairs);
     if together < OPPOSITE {
         return Err(Failure::Input(format!(
-            "{measured} falls where {reference} rises (correlation {together:.2}): found opposite signs, expected \
+            "{source}: {measured} falls where {reference} rises (correlation {together:.2}): found opposite signs, expected \
              discharge positive in both; to turn one: --map {measured}=-{measured}"
         )));
     }
@@ -206,16 +315,16 @@ pub(super) fn pair(
 pub(super) fn plausible(
     drive: &Drive,
     observed: &Observed,
+    wild: &Wild,
     sensor: &Sensor,
-    reference: &str,
-    measured: &str,
+    [reference, measured]: [&str; 2],
 ) -> Vec<String> {
     let mut remarks = Vec::new();
     let pairs = beside(drive, observed);
     if pairs.clone().count() < FEWEST_ROWS {
         return remarks;
     }
-    let together = correlation(pairs.clone());
+    let together = correlation(without(drive, observed, wild));
     if together.abs() < UNRELATED {
         remarks.push(format!(
             "{measured} does not follow {reference} (correlation {together:.2}): the reference may be that of another conductor"
@@ -239,6 +348,16 @@ pub(super) fn plausible(
         }
     }
     remarks.extend(clipped(pairs, measured));
+    if let Some(row) = wild.rows.first() {
+        remarks.push(format!(
+            "{measured} jumps there and back within {WILD_ROWS} rows in {} that {reference} does not show, the first at {} s: \
+             {} between readings around {:.4}; such readings may keep anything from fitting",
+            count(wild.places, "place"),
+            shown(observed.t_s[*row]),
+            observed.value[*row],
+            wild.between
+        ));
+    }
     remarks.extend(spikes(drive, observed, reference));
     remarks.extend(stuck(drive, observed, reference, measured));
     remarks
@@ -348,8 +467,7 @@ pub(super) fn battery(
     drive: &Drive,
     observed: &Observed,
     base: &BatteryBase,
-    name: &str,
-    current: &str,
+    [source, name, current]: [&str; 3],
 ) -> Result<(), Failure> {
     let pairs = beside(drive, observed);
     if pairs.clone().count() < FEWEST_ROWS {
@@ -359,7 +477,7 @@ pub(super) fn battery(
         let most = pairs.fold(0.0_f64, |most, (_, soc)| most.max(soc.abs()));
         if most <= 1.01 {
             return Err(Failure::Input(format!(
-                "{name}: found values up to {most}, expected per cent, 0 to 100"
+                "{source}, column {name}: found values up to {most}, expected per cent, 0 to 100"
             )));
         }
         return Ok(());
@@ -371,8 +489,26 @@ pub(super) fn battery(
     };
     if let Some(power) = thousands(middle / designed) {
         return Err(Failure::Input(format!(
-            "{name}: found voltages around {middle:.4}, 10^{} times the open-circuit voltage {designed:.4} V, expected V",
+            "{source}, column {name}: found voltages around {middle:.4}, 10^{} times the open-circuit voltage {designed:.4} V, expected V",
             3 * power
+        )));
+    }
+    let volts = base.ocv.iter().map(|(_, volts)| *volts);
+    let (low, high) = volts.fold((f64::INFINITY, 0.0_f64), |(low, high), volts| {
+        (low.min(volts), high.max(volts))
+    });
+    if middle > OTHER_CELLS * high || middle < low / OTHER_CELLS {
+        let hint = if name == PACK {
+            format!(
+                "; cells = {} in [battery] says how many are in series",
+                base.cells
+            )
+        } else {
+            format!("; a pack's voltage is {PACK}, with cells in [battery]")
+        };
+        return Err(Failure::Input(format!(
+            "{source}, column {name}: found voltages around {middle:.4} V, expected some within reach of the open-circuit \
+             voltage, {low:.4} … {high:.4} V{hint}"
         )));
     }
     // From one reading to the next the slow open-circuit voltage hardly matters.
@@ -383,7 +519,7 @@ pub(super) fn battery(
     let together = correlation(steps);
     if together > -OPPOSITE {
         return Err(Failure::Input(format!(
-            "{name} rises where {current} rises (correlation {together:.2}): found charging positive, expected discharge \
+            "{source}: {name} rises where {current} rises (correlation {together:.2}): found charging positive, expected discharge \
              positive; to turn it: --map {current}=-{current}"
         )));
     }

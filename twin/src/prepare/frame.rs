@@ -11,12 +11,17 @@ use crate::{failure::Failure, model::Model};
 #[derive(Clone, Debug)]
 pub struct Frame {
     recording: Recording,
+    /// Names and the columns that they were given to.
+    named: Vec<(String, String)>,
 }
 
 impl Frame {
     /// A recording as it is.
     pub fn new(recording: Recording) -> Self {
-        Self { recording }
+        Self {
+            recording,
+            named: Vec::new(),
+        }
     }
 
     /// The file's name.
@@ -27,6 +32,14 @@ impl Frame {
     /// Names of the columns.
     pub fn names(&self) -> Vec<&str> {
         self.recording.table().names().collect()
+    }
+
+    /// What the file itself calls a column.
+    pub fn origin<'a>(&'a self, name: &'a str) -> &'a str {
+        let named = self.named.iter().find(|(known, _)| known == name);
+        named.map_or(name, |(_, column)| {
+            column.strip_prefix('-').unwrap_or(column)
+        })
     }
 
     /// Whether there is such a column.
@@ -116,5 +129,8 @@ fn mapped(table: Table, wanted: &[(String, String)]) -> Result<Frame, Failure> {
     for (name, column) in wanted {
         mapping.add(name, column)?;
     }
-    Ok(Frame::new(table.mapped(&mapping)?.into_recording()?))
+    Ok(Frame {
+        recording: table.mapped(&mapping)?.into_recording()?,
+        named: wanted.to_vec(),
+    })
 }

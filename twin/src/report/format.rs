@@ -124,7 +124,11 @@ pub fn place(location: &Location) -> String {
     let end = |value: f64| quantity(&at_most(value, 4), &location.unit);
     let from = location.from.filter(|value| value.is_finite());
     let to = location.to.filter(|value| value.is_finite());
+    // Of a flag an open end leaves one value.
+    let flag = variable == "range_high" && location.unit == "1";
     match (from, to) {
+        (Some(1.0), None) if flag => format!("{variable} = 1"),
+        (None, Some(0.0)) if flag => format!("{variable} = 0"),
         (Some(from), Some(to)) if from == to => format!("{variable} = {}", end(from)),
         (Some(from), Some(to)) => format!("{variable} {} … {}", at_most(from, 4), end(to)),
         (Some(from), None) => format!("{variable} > {}", end(from)),
@@ -251,6 +255,27 @@ mod tests {
             with_interval(2.0, [f64::NEG_INFINITY, 5.0]),
             ["2.000", NONE, "5.000"]
         );
+    }
+
+    #[test]
+    fn a_flag_is_one_of_its_values() {
+        let mut location = Location {
+            signal: "i_meas_a".to_owned(),
+            kind: LocationKind::Region,
+            variable: "range_high".to_owned(),
+            unit: "1".to_owned(),
+            from: Some(1.0),
+            to: None,
+            energy_share: 1.0,
+            sample_share: 0.5,
+            p_value: 0.01,
+            effect: None,
+        };
+        assert_eq!(place(&location), "range_high = 1");
+        (location.from, location.to) = (None, Some(0.0));
+        assert_eq!(place(&location), "range_high = 0");
+        location.variable = "x".to_owned();
+        assert_eq!(place(&location), "x < 0");
     }
 
     #[test]

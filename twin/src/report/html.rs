@@ -122,6 +122,12 @@ fn head(page: &mut String, report: &Report) {
     if let Some(reference) = &report.inputs.reference {
         entry("Reference", reference);
     }
+    if !report.inputs.without.is_empty() {
+        entry(
+            "Taken out of the library",
+            &report.inputs.without.join(", "),
+        );
+    }
     page.push_str("</dl>\n<nav aria-label=\"Sections\"><ul>");
     for (id, title, shown) in [
         ("where", "Where", true),

@@ -256,6 +256,11 @@ fn left(report: &Report, width: usize, fullness: Fullness) -> Vec<String> {
 
 fn files(report: &Report, width: usize) -> Vec<String> {
     let mut lines = Vec::new();
+    let without = &report.inputs.without;
+    if !without.is_empty() {
+        let words = format!("Taken out of the library: {}", without.join(", "));
+        wrap(&mut lines, &words, 0, width, 2);
+    }
     let seconds = significant(report.seconds, 2);
     let names = "report.html, report.json, model.toml";
     let words = match &report.inputs.out {

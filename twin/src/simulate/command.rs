@@ -10,6 +10,7 @@ use crate::{
     explain,
     failure::Failure,
     model::Model,
+    overwrite,
     prepare::{Inputs, Item, Prepared, Purpose, prepare},
     problem::{Base, Problem, View},
     progress::Progress,
@@ -21,7 +22,9 @@ Example:
   twin simulate --model board.toml --recording drive.csv --out simulated.csv
 
 Writes t_s and, under the names of the recording, what the sensor, its charge counter and the battery of the model would
-have reported: as designed, and with the effects that the model file holds. docs/model-file.md describes the model file.";
+have reported: as designed, and with the effects that the model file holds. A column that --map calls by another name or
+turns is written under its new name and with its new sign: --map i_meas_a=-I writes i_meas_a, discharge positive.
+docs/model-file.md describes the model file.";
 
 /// Writes what the board as designed would have reported.
 #[derive(Args, Clone, Debug)]
@@ -47,7 +50,15 @@ pub struct Arguments {
 /// Simulates, and says in a few lines what was written.
 pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     convert::is_parquet(&arguments.out)?;
+    let reference = arguments.reference.as_deref();
+    let read = [
+        ("--model", arguments.model.as_path()),
+        ("--recording", arguments.recording.as_path()),
+    ];
+    let reference = reference.map(|path| ("--reference", path));
+    overwrite::refuse(&arguments.out, read.into_iter().chain(reference))?;
     let model = Model::read(&arguments.model)?;
+    overwrite::refuse(&arguments.out, model.ocv_file())?;
     let inputs = Inputs {
         recording: arguments.recording.clone(),
         reference: arguments.reference.clone(),

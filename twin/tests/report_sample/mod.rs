@@ -315,6 +315,7 @@ pub fn partly_explained_of(rows: usize) -> Report {
             model: "sensor.toml".to_owned(),
             recording: "drives/city.csv".to_owned(),
             reference: Some("drives/shunt.csv".to_owned()),
+            without: Vec::new(),
             out: Some("out/city".to_owned()),
         },
         plots: vec![plots],
