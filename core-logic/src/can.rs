@@ -508,7 +508,7 @@ pub struct Identity {
     pub version: [u8; 3],
     /// Cause of the last reset.
     pub reset_cause: ResetCause,
-    /// Starts; the low sixteen bits are sent.
+    /// Resets since the retained memory was last lost; the low sixteen bits are sent.
     pub boots: u32,
     /// First eight hexadecimal digits of the source revision.
     pub commit: u32,
@@ -528,7 +528,7 @@ pub struct Identity {
     pub uptime: Duration,
     /// Least free stack so far, in bytes.
     pub stack_free: u32,
-    /// Share of the log in use.
+    /// Share of the log in use; the firmware does not know it and leaves it out.
     pub log_fill: Option<Ppm>,
 }
 

@@ -39,7 +39,7 @@ tasks! {
     Tick = 100;
     /// RS485 server.
     Rs485 = 500;
-    /// Configuration and log; a block erase of the flash takes up to 2 s (W25Q32, block erase 64 KiB), polled between.
+    /// Configuration, state and log; it checks in while it waits for the flash, a sector's erase of up to 400 ms.
     Storage = 500;
     /// Analogue inputs, key state and its calibration.
     Environment = 500;

@@ -217,7 +217,7 @@ diagnoses! {
     33 ConfigurationCorruptRam: "The configuration in RAM failed its check; it is loaded again or defaults are used.",
         "CRC once a second";
         0 ms, 1000 ms, Critical, UntilCleared, [IMPLAUSIBLE] [IMPLAUSIBLE] [IMPLAUSIBLE]
-    34 LogFull: "The log overwrites records that were never read.",
+    34 LogFull: "The log is full: every new record replaces the oldest.",
         "oldest record replaced";
         0 ms, 0 ms, Info, UntilCleared, [] [] []
     35 WatchdogReset: "The last reset came from a watchdog.",
@@ -232,8 +232,8 @@ diagnoses! {
     38 StackHighWater: "Less stack has stayed free than the reserve.",
         "reserve of the firmware's stack check";
         0 ms, 0 ms, Warning, UntilCleared, [] [] []
-    39 ChargeRestoredWithLoss: "Charge and state of charge were restored from an older record.",
-        "bound on the loss kept with the record";
+    39 ChargeRestoredWithLoss: "Charge and state of charge were restored from an older record, or their record cannot be used.",
+        "a bound on the loss that is not 0: ChargeUncertainty";
         0 ms, 0 ms, Warning, UntilCleared, [] [] []
     40 SmallSensorOpen: "The small sensor is open; the large one measures in its place with its coarser resolution.",
         "as OpenSensor, with the dual-range front end in the large range";

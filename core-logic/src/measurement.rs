@@ -611,11 +611,16 @@ impl Measurement {
         report: &MeterReport,
         causes: Validity,
     ) {
-        self.meter = *report;
+        let mut report = *report;
+        if report.at.is_none() {
+            // Nothing was read since the start, and perhaps the counter not even handed over: what is known stands.
+            report.charge_total = self.meter.charge_total;
+        }
+        self.meter = report;
         self.meter_causes = causes
             .and_if(report.at.is_none(), Validity::STALE)
             .and_if(report.lost, Validity::CHIP_FAULT);
-        self.compare.on_meter(&configuration.compare, report);
+        self.compare.on_meter(&configuration.compare, &report);
         let now = report.at.unwrap_or(self.now);
         self.soc.update(
             &self.prepared.soc,

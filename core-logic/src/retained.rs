@@ -129,7 +129,8 @@ impl RetainedState {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct LogRecord {
-    /// Starts of the board so far.
+    /// Resets since the retained memory was last lost, that is since power-on: it names a start only together with the
+    /// records around it.
     pub boot: u32,
     /// Time since that start, in milliseconds.
     pub uptime_ms: u64,

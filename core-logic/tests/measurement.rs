@@ -16,13 +16,17 @@ mod host_board;
 mod ideal_board;
 
 use core_logic::configuration::Configuration;
-use core_logic::diagnosis::Code;
+use core_logic::diagnosis::{Code, CodeSet};
 use core_logic::error_budget::{ProfileSummary, charge_bound};
+use core_logic::front_end::KeyFactors;
 use core_logic::key_calibration::KeyPhase;
-use core_logic::measurement::{Order, Refusal};
+use core_logic::measurement::{Measurement, Order, Refusal, Vehicle};
+use core_logic::meter::MeterReport;
 use core_logic::open_sensor::network_output_open;
-use core_logic::range::Range;
-use core_logic::units::{Duration, Microamps, Microvolts};
+use core_logic::range::{EdgeRecorder, Range};
+use core_logic::retained::RetainedState;
+use core_logic::soc::SocRetained;
+use core_logic::units::{Duration, Instant, Microamps, Microvolts, Nanocoulombs, Ppm};
 use core_logic::validity::Validity;
 use host_board::{HostBoard, Step};
 use ideal_board::{Event, Row, Timing};
@@ -432,6 +436,54 @@ fn a_converter_input_that_reads_like_0_amps_is_found_by_the_charge() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
+
+    /// A start: until the meter has delivered, its empty reports change neither counter nor state of charge, and then
+    /// only what it has counted since is added.
+    #[test]
+    fn what_was_retained_stands_until_the_meter_delivers(
+        total_c in -1_000_000_i64..1_000_000, remaining_c in 10_000_i64..800_000,
+        charged_c in 0_i64..1_000_000, discharged_c in 0_i64..1_000_000,
+        empty in 0_usize..50, counted_c in -1_000_i64..1_000,
+    ) {
+        let mut configuration = Configuration::default();
+        configuration.soc.coulombic_efficiency = Ppm::ONE;
+        let retained = RetainedState {
+            charge_total: Nanocoulombs::from_coulombs(total_c),
+            soc: SocRetained {
+                remaining: Nanocoulombs::from_coulombs(remaining_c),
+                charged: Nanocoulombs::from_coulombs(charged_c),
+                discharged: Nanocoulombs::from_coulombs(discharged_c),
+                known: true,
+                ..SocRetained::default()
+            },
+            key_factors: KeyFactors::NONE,
+            ..RetainedState::default()
+        };
+        let (start, zero) = (Instant::from_ticks(0), Nanocoulombs::ZERO);
+        let mut measurement = Measurement::new(&configuration, Some(&retained), zero, start);
+        let history = EdgeRecorder::new(start, false).history(start);
+        for tick in 0..empty {
+            measurement.on_meter(&configuration, &MeterReport::default(), Validity::STALE);
+            let now = Instant::from_ticks(tick as u64 * 10_000);
+            measurement.tick(&configuration, now, &Vehicle::default(), &history, CodeSet::EMPTY);
+            let mut now = measurement.retained(0);
+            prop_assert!(now.soc.uncertainty >= zero);
+            now.soc.uncertainty = zero;
+            prop_assert_eq!(now, retained);
+            prop_assert!(!measurement.charge().validity.is_valid());
+        }
+        let report = MeterReport {
+            at: Some(Instant::from_ticks(1_000_000)),
+            charge_total: Nanocoulombs::from_coulombs(total_c + counted_c),
+            ..MeterReport::default()
+        };
+        measurement.on_meter(&configuration, &report, Validity::VALID);
+        let now = measurement.retained(0);
+        prop_assert_eq!(now.charge_total, report.charge_total);
+        prop_assert_eq!(now.soc.remaining, Nanocoulombs::from_coulombs(remaining_c - counted_c));
+        let throughput = now.soc.charged.saturating_add(now.soc.discharged);
+        prop_assert_eq!(throughput, Nanocoulombs::from_coulombs(charged_c + discharged_c + counted_c.abs()));
+    }
 
     /// Any profile, polling and snapshot latency: the charge on the bus is what flowed, within the budget.
     #[test]

@@ -3,12 +3,13 @@
 use core_logic::{
     can,
     configuration::Configuration,
+    design_parameters::METER_SPI_HZ,
     range::{EdgeRecorder, RangeHistory},
     storm::{StormAction, StormConfig, StormGuard},
     units::Instant,
 };
 use stm32f4xx_hal::{
-    gpio::{Edge, ExtiPin, GpioExt, Input, Output, PA0, PA4, PB12, PC4, PinState},
+    gpio::{Edge, ExtiPin, GpioExt, Input, Output, PA0, PA4, PB12, PC4, PinState, Speed},
     pac::{self, EXTI, SPI1, SPI2},
     rcc::{Enable, Reset},
     syscfg::SysCfgExt,
@@ -26,16 +27,20 @@ use crate::{
 /// RTIC's priority 3 in the four bits that the core has: (16 − 3) << 4.
 pub const SYSTICK_PRIORITY: u8 = (16 - 3) << 4;
 
-/// Mode 1 at APB2 / 32 = 2.625 MHz (`design_parameters::METER_SPI_HZ`).
+/// Mode 1 at APB2 / 32 = 2.625 MHz.
 const METER_SPI: spi::Settings = spi::Settings {
     second_edge: true,
     baud: 4,
 };
+const _: () = assert!(clock::APB2_HZ >> (METER_SPI.baud + 1) == METER_SPI_HZ);
 /// Mode 0 at APB1 / 2 = 21 MHz; the flash's slowest read command takes 50 MHz.
 const FLASH_SPI: spi::Settings = spi::Settings {
     second_edge: false,
     baud: 0,
 };
+/// For its clock and data: as they come out of a reset, pins follow 4 MHz, and with this 50 MHz (STM32F405 data sheet,
+/// I/O AC characteristics, 2.7 … 3.6 V). The meter's 2.625 MHz and all else stay below.
+const FLASH_EDGES: Speed = Speed::High;
 
 /// The range flag with its interrupt, and the external interrupts' mask that both lines share.
 pub struct Edges {
@@ -206,9 +211,9 @@ impl Board {
         let i2c_clock = /*       PB8  */ b.pb8.into_alternate_open_drain::<4>();
         let i2c_data = /*        PB9  */ b.pb9.into_alternate_open_drain::<4>();
         let flash_select = /*    PB12 */ b.pb12.into_push_pull_output_in_state(PinState::High);
-        let _flash_clock = /*    PB13 */ b.pb13.into_alternate::<5>();
+        let _flash_clock = /*    PB13 */ b.pb13.into_alternate::<5>().speed(FLASH_EDGES);
         let _flash_miso = /*     PB14 */ b.pb14.into_alternate::<5>();
-        let _flash_mosi = /*     PB15 */ b.pb15.into_alternate::<5>();
+        let _flash_mosi = /*     PB15 */ b.pb15.into_alternate::<5>().speed(FLASH_EDGES);
         let _sensor_supply = /*  PC0  */ c.pc0.into_analog();
         let _open_sensor = /*    PC1  */ c.pc1.into_analog();
         let mut meter_irq = /*   PC4  */ c.pc4.into_pull_up_input();

@@ -10,6 +10,7 @@ use bxcan::{
 use core_logic::{
     bus_off::{Action, BusOff, LatestQueue},
     can::Frame,
+    design_parameters::CAN_BITRATE,
     units::{Duration, Instant, elapsed},
 };
 use stm32f4xx_hal::{
@@ -17,11 +18,18 @@ use stm32f4xx_hal::{
     rcc::{Enable, Reset},
 };
 
+use crate::clock;
+
 /// The identifiers that the board sends.
 pub const SENT: usize = 12;
 
 /// APB1's 42 MHz / 6 = 7 MHz, 14 quanta a bit: 500 kbit/s. Sample point after 1 + 11 quanta (85.7 %), jump width 2.
 const BIT_TIMING: u32 = (2 - 1) << 24 | (2 - 1) << 20 | (11 - 1) << 16 | (6 - 1);
+const _: () = {
+    let quanta = 3 + (BIT_TIMING >> 16 & 0xF) + (BIT_TIMING >> 20 & 0x7);
+    let clocks = quanta * ((BIT_TIMING & 0x3FF) + 1);
+    assert!(clock::APB1_HZ == CAN_BITRATE * clocks);
+};
 /// A frame that the bus has not taken for so long is given up for a newer one: two periods of the current frame.
 const ABANDON_AFTER: Duration = Duration::from_ticks(20_000);
 

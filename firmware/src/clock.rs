@@ -6,6 +6,10 @@ use stm32f4xx_hal::pac::{FLASH, RCC};
 
 /// Core and AHB; SysTick counts it.
 pub const CORE_HZ: u32 = 168_000_000;
+/// CAN1 and SPI2, among others.
+pub const APB1_HZ: u32 = CORE_HZ / 4;
+/// SPI1, among others.
+pub const APB2_HZ: u32 = CORE_HZ / 2;
 
 /// Starts crystal and PLL and changes over to them (RM0090, reset and clock control).
 ///

@@ -81,9 +81,9 @@ pub fn loss_over_reset(previous: &Previous) -> Nanocoulombs {
     Nanocoulombs(clamp_i64(charge))
 }
 
-/// Charge that can have moved since the last record in flash.
-pub fn loss_over_power_off() -> Nanocoulombs {
-    SavePolicyConfig::default().loss_bound(LARGE_FULL_SCALE, SAVE_LATENCY)
+/// Charge that can have moved since the last record in flash, which this policy wrote.
+pub fn loss_over_power_off(policy: &SavePolicyConfig) -> Nanocoulombs {
+    policy.loss_bound(LARGE_FULL_SCALE, SAVE_LATENCY)
 }
 
 /// The most telling of the causes.

@@ -47,13 +47,14 @@ mod app {
         check_in::{CheckIn, Task},
         configuration::{Configuration, ConfigurationStore},
         converter::{ConverterSample, PollPace},
+        design_parameters,
         diagnosis::Code,
         front_end::Channel,
         measurement::{ConverterFault, Order},
         meter::{GapBridge, MeterChannel, MeterReport},
         modbus::{Command, CommandState, Event, Readings},
         modbus_rtu::Server,
-        retained::{RetainSlots, RetainedState, SavePolicy, Slot},
+        retained::{RetainSlots, RetainedState, SavePolicy, SavePolicyConfig, Slot},
         storm::StormConfig,
         units::{Duration, Instant, Nanocoulombs, elapsed},
     };
@@ -105,12 +106,14 @@ mod app {
         METER_WAKE.writer().write(());
     }
 
-    /// The flash has so long to deliver its content before the board starts without it: an erase that a reset left
-    /// running takes 400 ms, and the watchdog bites after 680 ms at the earliest.
+    /// The flash has so long to deliver its content before the board starts without what is missing: the configuration
+    /// comes first, 25 ms after an erase that a reset left running, 400 ms. The state takes 0.1 s more at most, and in
+    /// that case it is in RAM as well.
     const LOAD_LIMIT_MS: u32 = 450;
     /// Every task has to check in from here on, started or not.
     const START_LIMIT: Duration = Duration::from_ticks(1_000_000);
-    const METER_POLL_MS: u32 = 20;
+    #[expect(clippy::cast_possible_truncation, reason = "20 ms")]
+    const METER_POLL_MS: u32 = design_parameters::METER_POLL_MS as u32;
     /// The meter's steps lie halfway between two ticks: its priority is the higher one, and setting the chip up takes
     /// 0.6 ms, by which a frame would be late.
     const METER_PHASE_MS: u32 = TICK_MS / 2;
@@ -126,19 +129,11 @@ mod app {
     /// Stack that has to stay free.
     const STACK_RESERVE: usize = 8 * 1024;
 
-    /// Orders to the storage task.
-    #[derive(Clone, Copy, Default)]
-    pub struct Requests {
-        save: bool,
-        restore: bool,
-        clear_log: bool,
-    }
-
     /// What the two tasks of priority 1 share.
     pub struct Administration {
         store: ConfigurationStore,
-        requests: Requests,
-        busy: bool,
+        /// To the storage task, until it is done: save, restore or clear the log.
+        request: Option<Command>,
         /// Generation of the configuration that the flash holds.
         saved: Option<u32>,
         flash_counters: [u32; 5],
@@ -212,8 +207,7 @@ mod app {
             center,
             administration: Administration {
                 store,
-                requests: Requests::default(),
-                busy: false,
+                request: None,
                 saved: None,
                 flash_counters: [0; 5],
             },
@@ -652,7 +646,7 @@ mod app {
                     readings.configuration_crc = administration.store.crc();
                     readings.configuration_saved =
                         administration.saved == Some(administration.store.generation());
-                    readings.storage_busy = administration.busy;
+                    readings.storage_busy = administration.request.is_some();
                     readings.flash_counters = administration.flash_counters;
                     server.serve(now, &readings, &mut administration.store)
                 });
@@ -702,12 +696,12 @@ mod app {
                     (*store.active(), store.crc(), changed, damaged)
                 });
             if changed {
-                apply(&mut cx, &active);
+                apply(&mut cx, &active, crc);
             } else if corrupt {
                 // What the measurement works with is a copy. Its CRC takes 0.5 ms, which the tick must not wait for.
                 let copy = cx.shared.center.lock(|center| center.configuration);
                 if copy.crc() != crc {
-                    apply(&mut cx, &active);
+                    apply(&mut cx, &active, crc);
                     damaged = true;
                 }
             }
@@ -728,10 +722,10 @@ mod app {
     }
 
     /// Hands another active configuration to the owners of its parts.
-    fn apply(cx: &mut rs485::Context<'_>, active: &Configuration) {
+    fn apply(cx: &mut rs485::Context<'_>, active: &Configuration, crc: u32) {
         cx.shared.center.lock(|center| {
             center.set_configuration(active);
-            center.identity.configuration_crc = active.crc();
+            center.identity.configuration_crc = crc;
         });
         cx.shared
             .edges
@@ -798,14 +792,7 @@ mod app {
             Command::ClearDiagnoses => Order::ClearDiagnoses,
             Command::Save | Command::Restore | Command::ClearLog => {
                 center.lock(|center| center.measurement.note_command(CommandState::Running, 0));
-                administration.lock(|administration| {
-                    administration.busy = true;
-                    match command {
-                        Command::Save => administration.requests.save = true,
-                        Command::Restore => administration.requests.restore = true,
-                        _ => administration.requests.clear_log = true,
-                    }
-                });
+                administration.lock(|administration| administration.request = Some(command));
                 return;
             }
             Command::FactoryDefaults => {
@@ -831,12 +818,14 @@ mod app {
     #[task(priority = 1, local = [storage, previous], shared = [center, administration, meter_link])]
     async fn storage(mut cx: storage::Context) {
         let storage = cx.local.storage;
+        let (mut stored, mut state) = (Stored::Refused, Stored::Refused);
         let load = async {
             storage.start().await;
-            (storage.configuration().await, storage.state().await)
+            stored = storage.configuration().await;
+            state = storage.state().await;
         };
-        let loaded = Mono::timeout_after(LOAD_LIMIT_MS.millis(), load).await;
-        let (stored, state) = loaded.unwrap_or((Stored::Refused, Stored::Refused));
+        // What has not come in time counts as refused.
+        let _ = Mono::timeout_after(LOAD_LIMIT_MS.millis(), load).await;
         let now = time::now();
 
         let configuration = cx.shared.administration.lock(|administration| {
@@ -847,29 +836,32 @@ mod app {
             }
             *administration.store.active()
         });
-        // Without a record the next start could not even say that something was lost.
-        let mut first_save = !matches!(state, Stored::Value(_));
-        let retained = retained_state(cx.local.previous, state);
-        let (charge, calibration) = cx.shared.center.lock(|center| {
-            let (state, slots, loss) = &retained;
-            let calibration = center.resume(configuration, state.as_ref(), *slots, *loss, now);
-            center.identity.configuration_crc = configuration.crc();
+        let start = retained_state(cx.local.previous, &state, &configuration.save_policy);
+        // The next start must not find nothing, nor what is older than this one's.
+        let mut first_save = !start.is_in_flash;
+        let charge = start.state.map(|state| state.charge_total);
+        let crc = configuration.crc();
+        let calibration = cx.shared.center.lock(|center| {
+            center.identity.configuration_crc = crc;
+            center.conditions.flash_fault |= start.is_refused;
             if matches!(stored, Stored::Refused) {
                 center
                     .conditions
                     .happened
                     .set(Code::ConfigurationDefault, true);
             }
-            (state.as_ref().map(|state| state.charge_total), calibration)
+            center.resume(
+                configuration,
+                start.state.as_ref(),
+                start.slots,
+                start.loss,
+                now,
+            )
         });
         cx.shared
             .meter_link
             .lock(|link| link.calibration = calibration);
-        defmt::info!(
-            "configuration {=u32:08x}, charge {}",
-            configuration.crc(),
-            charge
-        );
+        defmt::info!("configuration {=u32:08x}, charge {}", crc, charge);
         // Each is spawned once, here.
         let _ = meter_owner::spawn(charge);
         let _ = conversion::spawn();
@@ -877,23 +869,18 @@ mod app {
 
         let mut policy = SavePolicy::new(now, charge.unwrap_or(Nanocoulombs::ZERO));
         let mut since_log_ms = 0;
+        let mut clearing = false;
         loop {
-            Mono::delay(100.millis()).await;
+            let turn_ms = if clearing { 10 } else { 100 };
+            Mono::delay(turn_ms.millis()).await;
             alive(Task::Storage);
-            since_log_ms += 100;
-            let requests = cx
-                .shared
-                .administration
-                .lock(|administration| core::mem::take(&mut administration.requests));
-            if requests.save || requests.restore || requests.clear_log {
-                serve(
-                    storage,
-                    requests,
-                    &mut cx.shared.center,
-                    &mut cx.shared.administration,
-                )
-                .await;
-            }
+            since_log_ms += turn_ms;
+            clearing = serve(
+                storage,
+                &mut cx.shared.center,
+                &mut cx.shared.administration,
+            )
+            .await;
             let now = time::now();
             let (state, save) = cx.shared.center.lock(|center| {
                 (
@@ -907,13 +894,14 @@ mod app {
                 first_save = false;
                 policy.saved(now, state.charge_total);
             }
-            let due = cx
-                .shared
-                .center
-                .lock(|center| core::mem::take(&mut center.log_due));
-            if due || since_log_ms >= LOG_PERIOD_MS {
+            // A log that is being cleared gets its next record afterwards.
+            let due = !clearing
+                && (since_log_ms >= LOG_PERIOD_MS
+                    || cx.shared.center.lock(|center| center.log_due));
+            if due {
                 since_log_ms = 0;
                 let record = cx.shared.center.lock(|center| {
+                    center.log_due = false;
                     let boot = center.identity.boots;
                     center.measurement.log_record(&center.configuration, boot)
                 });
@@ -927,63 +915,97 @@ mod app {
         }
     }
 
-    /// The state to go on with, how the slots continue, and the bound on what the reset has cost.
-    fn retained_state(
-        previous: &Previous,
-        stored: Stored<RetainedState>,
-    ) -> (Option<RetainedState>, RetainSlots, Nanocoulombs) {
-        match RetainSlots::recover(&retain::slot(Slot::A), &retain::slot(Slot::B)) {
-            Ok((state, slots)) => (Some(state), slots, identity::loss_over_reset(previous)),
-            Err(_) => match stored {
-                Stored::Value(state) => (
-                    Some(state),
-                    RetainSlots::empty(),
-                    identity::loss_over_power_off(),
-                ),
-                _ => (None, RetainSlots::empty(), Nanocoulombs::ZERO),
-            },
-        }
+    /// What to go on with.
+    struct Start {
+        state: Option<RetainedState>,
+        slots: RetainSlots,
+        /// Bound on what the reset has cost.
+        loss: Nanocoulombs,
+        /// The state is the flash's newest.
+        is_in_flash: bool,
+        /// There may have been a state, and it cannot be used.
+        is_refused: bool,
     }
 
-    /// Save, restore, clear the log.
+    /// The slots' state, else the one of the flash, which `policy` wrote.
+    fn retained_state(
+        previous: &Previous,
+        stored: &Stored<RetainedState>,
+        policy: &SavePolicyConfig,
+    ) -> Start {
+        let mut start = Start {
+            state: None,
+            slots: RetainSlots::empty(),
+            loss: Nanocoulombs::ZERO,
+            is_in_flash: false,
+            is_refused: false,
+        };
+        match (
+            RetainSlots::recover(&retain::slot(Slot::A), &retain::slot(Slot::B)),
+            stored,
+        ) {
+            (Ok((state, slots)), _) => {
+                start.state = Some(state);
+                start.slots = slots;
+                start.loss = identity::loss_over_reset(previous);
+            }
+            (Err(_), Stored::Value(state)) => {
+                start.state = Some(*state);
+                start.loss = identity::loss_over_power_off(policy);
+                start.is_in_flash = true;
+            }
+            (Err(_), Stored::Refused) => {
+                // Nobody knows what is missing.
+                start.loss = Nanocoulombs(i64::MAX);
+                start.is_refused = true;
+            }
+            (Err(_), Stored::Nothing) => {}
+        }
+        start
+    }
+
+    /// Save, restore, or the next sector of the log to be cleared; whether there are more of them.
     async fn serve(
         storage: &mut Storage,
-        requests: Requests,
         center: &mut impl rtic::Mutex<T = Center>,
         administration: &mut impl rtic::Mutex<T = Administration>,
-    ) {
-        let mut done = true;
-        if requests.save {
-            let (configuration, generation) = administration.lock(|administration| {
-                (
-                    *administration.store.active(),
-                    administration.store.generation(),
-                )
-            });
-            done &= storage.save_configuration(&configuration).await;
-            if done {
-                administration.lock(|administration| administration.saved = Some(generation));
+    ) -> bool {
+        let (request, configuration, generation) = administration.lock(|administration| {
+            let store = &administration.store;
+            (administration.request, *store.active(), store.generation())
+        });
+        let done = match request {
+            None => return false,
+            Some(Command::Save) => {
+                let done = storage.save_configuration(&configuration).await;
+                if done {
+                    administration.lock(|administration| administration.saved = Some(generation));
+                }
+                done
             }
-        }
-        if requests.restore {
-            match storage.configuration().await {
+            Some(Command::Restore) => match storage.configuration().await {
                 Stored::Value(configuration) => administration.lock(|administration| {
-                    done &= administration.store.commit(configuration).is_ok();
-                    administration.saved = Some(administration.store.generation());
+                    let store = &mut administration.store;
+                    let done = store.commit(configuration).is_ok();
+                    administration.saved = Some(store.generation());
+                    done
                 }),
-                Stored::Nothing | Stored::Refused => done = false,
-            }
-        }
-        if requests.clear_log {
-            done &= storage.clear_log().await;
-        }
+                Stored::Nothing | Stored::Refused => false,
+            },
+            Some(_) => match storage.clear_log_sector().await {
+                Ok(true) => return true,
+                Ok(false) => true,
+                Err(()) => false,
+            },
+        };
         let state = if done {
             CommandState::Done
         } else {
             CommandState::Failed
         };
         center.lock(|center| center.measurement.note_command(state, 0));
-        administration.lock(|administration| administration.busy = false);
+        administration.lock(|administration| administration.request = None);
+        false
     }
 
     /// Once per turn of the storage task: its conditions; once a second the state, and at times the stack.

@@ -52,6 +52,9 @@ pub struct Counters {
     pub lost: u32,
 }
 
+#[expect(clippy::cast_possible_truncation, reason = "4 KiB")]
+const SECTOR: u32 = flash::SECTOR as u32;
+
 fn count(counter: &mut u32) {
     *counter = counter.saturating_add(1);
 }
@@ -76,6 +79,8 @@ pub struct Storage {
     log_full: bool,
     failed: bool,
     overwrites: bool,
+    /// Where the clearing of the log goes on.
+    cleared: u32,
 }
 
 impl Storage {
@@ -90,6 +95,7 @@ impl Storage {
             log_full: false,
             failed: false,
             overwrites: false,
+            cleared: LOG.start,
         }
     }
 
@@ -181,7 +187,8 @@ impl Storage {
             }
         }
         // Nothing intact in a region that is not blank: there was a record once, and it is damaged.
-        if length.is_none() && !self.is_blank(region).await {
+        let end = region.end;
+        if length.is_none() && self.first_written(region).await < end {
             count(&mut self.counters.refused);
             self.failed = true;
             return Err(());
@@ -189,18 +196,17 @@ impl Storage {
         Ok(length.and_then(|length| self.record.get(..length)))
     }
 
-    /// Whether none of the region's sectors has ever been written.
-    async fn is_blank(&mut self, region: Range<u32>) -> bool {
-        let sector = u32::try_from(flash::SECTOR).unwrap_or(u32::MAX);
+    /// The region's first sector that was written, or cannot be read; its end without one.
+    async fn first_written(&mut self, region: Range<u32>) -> u32 {
         let mut at = region.start;
         while at < region.end {
             let mut mark = [0; 4];
             if self.flash.read(at, &mut mark).await.is_err() || mark != [0xFF; 4] {
-                return false;
+                break;
             }
-            at += sector;
+            at += SECTOR;
         }
-        true
+        at
     }
 
     /// Writes the configuration; whether it is in the flash.
@@ -277,26 +283,25 @@ impl Storage {
         }
     }
 
-    /// Erases the log: the sectors that were written, 45 ms each, at most 400 ms.
-    pub async fn clear_log(&mut self) -> bool {
-        let sector = u32::try_from(flash::SECTOR).unwrap_or(u32::MAX);
-        let mut at = LOG.start;
-        while at < LOG.end {
-            let mut mark = [0; 4];
-            let blank = self.flash.read(at, &mut mark).await.is_ok() && mark == [0xFF; 4];
-            if !blank && let Err(error) = self.flash.erase(at, at + sector).await {
-                defmt::error!("flash: {}", error);
-                count(&mut self.counters.failures);
-                self.failed = true;
-                return false;
-            }
-            if !blank {
-                count(&mut self.counters.erased);
-            }
-            at += sector;
+    /// Erases the log's next sector that was written, 45 ms, at most 400 ms; whether there may be another one. All of
+    /// them in one go would take 23 s and more, in which no charge is saved.
+    pub async fn clear_log_sector(&mut self) -> Result<bool, ()> {
+        // On from the last one, for a worn sector may never look blank.
+        let from = core::mem::replace(&mut self.cleared, LOG.start);
+        let at = self.first_written(from..LOG.end).await;
+        if at >= LOG.end {
+            self.log_full = false;
+            return Ok(false);
         }
-        self.log_full = false;
-        true
+        if let Err(error) = self.flash.erase(at, at + SECTOR).await {
+            defmt::error!("flash: {}", error);
+            count(&mut self.counters.failures);
+            self.failed = true;
+            return Err(());
+        }
+        count(&mut self.counters.erased);
+        self.cleared = at + SECTOR;
+        Ok(true)
     }
 }
 

@@ -308,7 +308,7 @@ inputs! {
     0x0060 I64 1 "charge" "mC" "net, positive is discharge (1 mC = 1 mA·s)" |r, _| mc(r.charge);
     0x0064 I64 1 "charge in" "mC" "charged" |r, _| mc(r.charge_in);
     0x0068 I64 1 "charge out" "mC" "discharged" |r, _| mc(r.charge_out);
-    0x006C I64 1 "charge uncertainty" "mC" "bound on what hand-overs and bridged gaps may have cost" |r, _| mc(r.charge_uncertainty);
+    0x006C I64 1 "charge uncertainty" "mC" "bound on what the last start, hand-overs and bridged gaps may have cost" |r, _| mc(r.charge_uncertainty);
     0x0070 I64 1 "channel difference" "mC" "meter less converter over the last window" |r, _| mc(r.channel_difference);
     0x0074 I64 1 "channel bound" "mC" "what they may differ by" |r, _| mc(r.channel_bound);
     0x0078 U32 1 "estimated intervals" "" "meter intervals whose split between the ranges was estimated" |r, _| r.estimated_intervals.into();

@@ -139,8 +139,8 @@ impl Port {
 /// Ports A, B and C; their registers follow one another at [`PORT_STRIDE`].
 ///
 /// The level of a pin in alternate mode is what the outside drives, or its pull: what the MCU's own peripheral puts on it
-/// is not seen. A pin that nothing drives or pulls reads low. Not modelled: the configuration lock and the output speed
-/// (stored, without effect).
+/// is not seen. A pin that nothing drives or pulls reads low. Of the output speed only the fastest clock is modelled
+/// ([`GpioPorts::fastest_hz`]), which the bus holds the SPI masters to. Not modelled: the configuration lock.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GpioPorts {
     ports: [Port; PORTS],
@@ -179,6 +179,13 @@ impl GpioPorts {
         }
         let field = port.afr[usize::from(pin.number / 8)] >> (4 * (pin.number % 8)) & 0xF;
         u8::try_from(field).ok()
+    }
+
+    /// The fastest clock that an output of this speed follows (STM32F405 data sheet, I/O AC characteristics, 2.7 … 3.6 V
+    /// and 50, 50, 40 and 30 pF; *assumed* until it has been compared with the newest revision).
+    pub fn fastest_hz(&self, pin: Pin) -> u64 {
+        let ospeedr = self.ports[usize::from(pin.port)].ospeedr;
+        [4_000_000, 25_000_000, 50_000_000, 100_000_000][(ospeedr >> (2 * pin.number) & 3) as usize]
     }
 
     /// Whether a pin is in analogue mode, as an ADC input has to be.

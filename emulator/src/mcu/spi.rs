@@ -108,6 +108,11 @@ impl Spi {
         }
     }
 
+    /// What divides the clock of its APB.
+    pub const fn divider(&self) -> u64 {
+        2 << ((self.cr1 & BR) >> 3)
+    }
+
     const fn registers(&self) -> &'static Registers {
         match self.bus {
             SpiBus::Meter => &METER,
@@ -156,7 +161,7 @@ impl Spi {
             SpiBus::Meter => context.clocks.apb2,
             SpiBus::Flash => context.clocks.apb1,
         };
-        let divider = 2_u64 << ((self.cr1 & BR) >> 3);
+        let divider = self.divider();
         self.shifting = Some(Shifting {
             byte,
             begin,

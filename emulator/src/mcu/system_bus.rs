@@ -21,7 +21,7 @@ use crate::mcu::syscfg::Syscfg;
 use crate::mcu::tim2::Tim2;
 use crate::mcu::usart::Usart;
 use crate::mcu::{Clocks, Context, Interrupts, Peripheral, Unmodelled};
-use crate::outside::{Outputs, Outside, PORTS, SpiBus};
+use crate::outside::{Outputs, Outside, PORTS, Pin, SpiBus};
 use crate::rs485_line::LineConfig;
 use crate::time::Ticks;
 
@@ -227,6 +227,32 @@ impl State {
         }?;
         if block == Block::Rcc {
             self.follow_rcc(now)?;
+        }
+        self.check_edges(block, offset)
+    }
+
+    /// Clock and data of an SPI master that sends have to be able to follow its clock: real pins would round the edges off.
+    fn check_edges(&self, block: Block, offset: u32) -> Result<(), Unmodelled> {
+        const SPI_DR: u32 = 0x0C;
+        if offset != SPI_DR {
+            return Ok(());
+        }
+        let (spi, clock, port, pins) = match block {
+            Block::Spi1 => (&self.spi1, self.clocks.apb2, 'A', [5, 7]),
+            Block::Spi2 => (&self.spi2, self.clocks.apb1, 'B', [13, 15]),
+            _ => return Ok(()),
+        };
+        let clock_hz = u64::from(clock) / spi.divider();
+        for pin in pins {
+            let fastest_hz = self.gpio.fastest_hz(Pin::new(port, pin));
+            if clock_hz > fastest_hz {
+                return Err(Unmodelled {
+                    register: format!("GPIO{port}_OSPEEDR"),
+                    what: format!(
+                        "{clock_hz} Hz of {block:?} on pin {pin}, whose speed is for {fastest_hz} Hz"
+                    ),
+                });
+            }
         }
         Ok(())
     }

@@ -1,8 +1,9 @@
 //! F19 … F21: the flash and the supply.
 
+use emulator::mcu::rcc::ResetCause;
 use emulator::rig::{Rig, Setup};
-use emulator::scenario::{Contactors, Scenario};
-use plant::w25q32::SECTOR;
+use emulator::scenario::{Contactors, Key, Scenario};
+use plant::w25q32::{SECTOR, Timing};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
@@ -201,12 +202,7 @@ fn fault_f19_a_cut_off_state_costs_one_save_interval() {
     // Saves as often as it can: whatever has changed by 1 C.
     let mut rig = boot(Vec::new(), 0.0);
     rig.run_s(0.4).unwrap();
-    let interval_nc = 1_000_000_000_u64;
-    let words: Vec<u16> = (0..4)
-        .rev()
-        .map(|word| (interval_nc >> (16 * word)) as u16)
-        .collect();
-    write_registers(&mut rig, 0x0840, &words).unwrap();
+    set_save_interval(&mut rig, 1);
     save(&mut rig);
     let flash = content(&mut rig);
     let mut rig = boot(flash.clone(), current_a);
@@ -361,4 +357,238 @@ fn fault_f21_a_loss_of_power_costs_no_more_than_is_declared() {
         assert!(was_raised(&rig, "ChargeRestoredWithLoss"));
     }
     assert!(beyond.is_empty(), "beyond what is declared: {beyond:?}");
+}
+
+/// Charge on the bus, and everything that was discharged and charged, in C.
+fn charge_and_throughput_c(rig: &Rig<'_>) -> (f64, f64, f64) {
+    let throughput = |signal| rig.view.signal("Throughput", signal).unwrap();
+    (
+        charge_c(rig),
+        throughput("ChargeDischarged"),
+        throughput("ChargeCharged"),
+    )
+}
+
+#[test]
+fn fault_f21_charge_and_throughput_go_on_without_a_jump() {
+    // Once without power, once as a warm reset: the same counter, from flash and from RAM.
+    for by_power in [true, false] {
+        let current_a = 550.0;
+        let mut rig = boot(Vec::new(), current_a);
+        // At 360 C it is saved.
+        rig.run_s(4.0).unwrap();
+        let (charge_before_c, discharged_before_c, charged_before_c) =
+            charge_and_throughput_c(&rig);
+        assert!(charge_before_c > 1_500.0);
+        if by_power {
+            rig.power_cycle();
+        } else {
+            rig.machine.reset(ResetCause::Software);
+        }
+        rig.view = Default::default();
+        let mut smallest_c = f64::INFINITY;
+        watch(&mut rig, 1.5, |rig| {
+            if let Some(charge_c) = rig.view.charge_c().value {
+                smallest_c = smallest_c.min(charge_c);
+            }
+        });
+        let (charge_after_c, discharged_after_c, charged_after_c) = charge_and_throughput_c(&rig);
+        println!(
+            "F21 {}: charge {charge_before_c:.0} C, then {smallest_c:.0} … {charge_after_c:.0} C; throughput \
+             ({discharged_before_c:.0}, {charged_before_c:.0}) C, then ({discharged_after_c:.0}, {charged_after_c:.0}) C",
+            if by_power { "power" } else { "reset" },
+        );
+        // A save interval, its turn and the second between two frames of the throughput.
+        let lost_c = 360.0 + current_a;
+        assert!(smallest_c >= charge_before_c - lost_c, "{smallest_c}");
+        assert_eq!((charged_before_c, charged_after_c), (0.0, 0.0));
+        assert!((charge_after_c - discharged_after_c).abs() <= current_a * 1.1);
+    }
+}
+
+/// Charge from which on the state is saved, in C.
+fn set_save_interval(rig: &mut Rig<'_>, coulombs: u64) {
+    let nanocoulombs = coulombs * 1_000_000_000;
+    let words: Vec<u16> = (0..4)
+        .rev()
+        .map(|word| (nanocoulombs >> (16 * word)) as u16)
+        .collect();
+    write_registers(rig, 0x0840, &words).unwrap();
+}
+
+#[test]
+fn fault_f21_after_resets_the_flash_still_follows_the_counter() {
+    let current_a = 550.0;
+    let mut rig = boot(Vec::new(), current_a);
+    rig.run_s(0.7).unwrap();
+    let before = charges_c(&mut rig);
+    // Each time less than a save interval.
+    for _ in 0..4 {
+        rig.machine.reset(ResetCause::Software);
+        rig.view = Default::default();
+        rig.run_s(0.6).unwrap();
+    }
+    rig.power_cycle();
+    rig.view = Default::default();
+    rig.run_s(0.6).unwrap();
+    let error_c = charge_error_c(&mut rig, before);
+    let declared_c = rig
+        .view
+        .signal("MeterCurrent", "ChargeUncertainty")
+        .unwrap();
+    println!(
+        "F21 after four resets: charge {error_c:+.1} C, declared {declared_c} C of the last start alone"
+    );
+    // Four starts of 0.2 s, in which nobody counts to the word, and what the loss of power costs.
+    assert!(error_c.abs() <= 5.0 * 0.25 * current_a + 360.0, "{error_c}");
+}
+
+#[test]
+fn fault_f21_the_declared_loss_is_that_of_the_policy_in_force() {
+    let current_a = 550.0;
+    for interval_c in [10, 2_000] {
+        let mut rig = boot(Vec::new(), 0.0);
+        rig.run_s(0.4).unwrap();
+        set_save_interval(&mut rig, interval_c);
+        save(&mut rig);
+        let flash = content(&mut rig);
+        let mut rig = boot(flash, current_a);
+        rig.run_s(3.5).unwrap();
+        let before = charges_c(&mut rig);
+        rig.power_cycle();
+        rig.view = Default::default();
+        rig.run_s(0.6).unwrap();
+        let error_c = charge_error_c(&mut rig, before);
+        let declared_c = rig
+            .view
+            .signal("MeterCurrent", "ChargeUncertainty")
+            .unwrap();
+        println!("F21 interval {interval_c} C: charge {error_c:+.1} C, declared {declared_c} C");
+        assert!(error_c.abs() <= declared_c, "{error_c} {declared_c}");
+        // The interval, and a second at 600 A.
+        assert!(
+            (declared_c - interval_c as f64 - 600.0).abs() <= 1.0,
+            "{declared_c}"
+        );
+    }
+}
+
+/// A flash that has been in use: its state fills its region, which so takes longest to read, the log some sectors.
+/// The capacity is 100 Ah.
+fn used_flash() -> Vec<u8> {
+    let mut rig = boot(Vec::new(), 0.0);
+    rig.run_s(0.4).unwrap();
+    set_capacity(&mut rig, 100_000);
+    set_save_interval(&mut rig, 1);
+    save(&mut rig);
+    let flash = content(&mut rig);
+    let mut rig = boot(flash, 300.0);
+    // A record a turn.
+    rig.run_s(11.0).unwrap();
+    let mut flash = content(&mut rig);
+    let sectors = |from: usize| from..from + SECTOR;
+    let (full, newest) = (sectors(0x1_0000), sectors(0x1_1000));
+    assert!(flash[newest.start] != 0xFF, "the first sector is not full");
+    flash.copy_within(newest, 0x1_F000);
+    for sector in 1..15 {
+        flash.copy_within(full.clone(), 0x1_0000 + sector * SECTOR);
+    }
+    for sector in 1..30 {
+        flash.copy_within(full.clone(), 0x20_0000 + sector * SECTOR);
+    }
+    flash
+}
+
+/// The same with high voltage off; `shift_v` at the sensor's output looks like a current to the meter.
+fn boot_parked(flash: Vec<u8>, timing: Timing, shift_v: f64) -> Rig<'static> {
+    let mut row = row(0.0).with_key(Key::Off);
+    row.output_shift_v = shift_v;
+    let mut setup = Setup::nominal(Scenario::steady(row, Contactors::Permitted));
+    setup.flash = Some(flash);
+    setup.nor.timing = timing;
+    rig_of(setup)
+}
+
+#[test]
+fn fault_f24_an_erase_under_way_does_not_cost_the_configuration() {
+    let mut rig = boot_parked(used_flash(), Timing::SLOWEST, 0.0);
+    rig.run_s(0.6).unwrap();
+    assert_eq!(capacity(&mut rig), 100_000);
+    // Clear the log, and a reset as soon as it erases, which it does for 400 ms.
+    command(&mut rig, 10).unwrap();
+    until(&mut rig, "an erase", 0.5, |rig| {
+        let now_s = rig.now_s();
+        board(rig, |board| {
+            board.flash.advance(now_s);
+            board.flash.is_busy()
+        })
+    });
+    rig.run_s(0.01).unwrap();
+    rig.machine.reset(ResetCause::Software);
+    rig.view = Default::default();
+    rig.run_s(0.9).unwrap();
+    println!(
+        "F24 in an erase: capacity {}, {:?}",
+        capacity(&mut rig),
+        unexpected(&rig, &[])
+    );
+    assert_eq!(capacity(&mut rig), 100_000);
+    assert!(!was_raised(&rig, "ConfigurationDefault"));
+    assert!(!was_raised(&rig, "FlashFault"));
+}
+
+#[test]
+fn fault_f21_the_charge_is_saved_while_the_log_is_cleared() {
+    let mut rig = boot_parked(used_flash(), Timing::TYPICAL, 0.4);
+    rig.run_s(0.8).unwrap();
+    command(&mut rig, 10).unwrap();
+    // Thirty sectors of 45 ms.
+    rig.run_s(0.9).unwrap();
+    assert_eq!(input_registers(&mut rig, 0x0023, 1), [1], "it still runs");
+    assert_eq!(command(&mut rig, 7), Err(6), "busy until it is done");
+    let charge_before_c = charge_c(&rig);
+    rig.power_cycle();
+    rig.view = Default::default();
+    rig.run_s(0.4).unwrap();
+    let charge_after_c = charge_c(&rig);
+    println!("F21 while the log is cleared: {charge_before_c:.1} C, then {charge_after_c:.1} C");
+    // A save interval of 1 C, 10.7 A for 0.2 s until it is written, the frame's age.
+    assert!((charge_after_c - charge_before_c).abs() <= 5.0);
+
+    // What is left is cleared, and it ends.
+    command(&mut rig, 10).unwrap();
+    until(&mut rig, "the end", 4.0, |rig| {
+        input_registers(rig, 0x0023, 1) == [2]
+    });
+    let flash = content(&mut rig);
+    let used = (0x20_0000..0x40_0000)
+        .step_by(SECTOR)
+        .filter(|at| flash[*at] != 0xFF)
+        .count();
+    assert!(used <= 1, "{used} sectors");
+}
+
+#[test]
+fn fault_f20_a_state_that_cannot_be_used_is_declared() {
+    let mut rig = boot(Vec::new(), 50.0);
+    rig.run_s(1.0).unwrap();
+    save(&mut rig);
+    let mut flash = content(&mut rig);
+    // An intact record of another kind: the configuration's.
+    flash.copy_within(0..SECTOR, 0x1_0000);
+    let mut rig = boot(flash, 50.0);
+    rig.run_s(0.6).unwrap();
+    let said = |rig: &Rig<'_>, message, signal| rig.view.signal(message, signal).unwrap();
+    println!(
+        "F20 state refused: charge {:.1} C, declared {} C, estimated {}, {:?}",
+        charge_c(&rig),
+        said(&rig, "MeterCurrent", "ChargeUncertainty"),
+        said(&rig, "Charge", "ChargeEstimated"),
+        unexpected(&rig, &[])
+    );
+    assert!(was_raised(&rig, "FlashFault"));
+    assert!(was_raised(&rig, "ChargeRestoredWithLoss"));
+    assert_eq!(said(&rig, "Charge", "ChargeEstimated"), 1.0);
+    // The frame's largest.
+    assert_eq!(said(&rig, "MeterCurrent", "ChargeUncertainty"), 2621.42);
 }
