@@ -382,7 +382,7 @@ fn area(t_s: &[f64], input: &[f64], row: usize, held: bool) -> f64 {
     mean * (t_s[row + 1] - t_s[row])
 }
 
-/// Integral over time from the start of each segment, over each step as [`area`].
+/// Integral over time from the start of each segment: trapezoids, or the last value held.
 pub fn integral(t_s: &[f64], segments: &[Range<usize>], input: &[f64], held: bool) -> Vec<f64> {
     let mut output = vec![0.0; input.len()];
     for rows in segments.iter().filter(|rows| !rows.is_empty()) {
