@@ -275,7 +275,7 @@ fn one(
     report.models.push(fitted(problem, &selection.fit));
     report
         .remarks
-        .extend(base_found(problem, selection.fit.model.nuisance));
+        .extend(base_found(&problem.name, selection.fit.model.nuisance));
     report.plots.push(plots(&read, &shown, &held.read));
     let sentence = sentence(bench, &selection, (verdict, doubted), left, report);
     Part {
@@ -1222,7 +1222,7 @@ pub fn predict(problem: &Problem, effects: &[(String, Vec<f64>)]) -> Vec<f64> {
 
 /// What was found of a battery within what the model file leaves open: it is no physics that was left out, and part of every error
 /// after it.
-fn base_found(problem: &Problem, nuisance: Nuisance) -> Option<String> {
+fn base_found(name: &str, nuisance: Nuisance) -> Option<String> {
     let by = |share: f64, what: &str, unit: &str| {
         let percent = 100.0 * share;
         let way = if percent > 0.0 { "higher" } else { "lower" };
@@ -1239,8 +1239,7 @@ fn base_found(problem: &Problem, nuisance: Nuisance) -> Option<String> {
     .collect();
     (!found.is_empty()).then(|| {
         format!(
-            "{}: within what the model file leaves open, {} than stated fits; the errors after are with that",
-            problem.name,
+            "{name}: within what the model file leaves open, {} than stated fits; the errors after are with that",
             found.join(" and ")
         )
     })
@@ -1272,6 +1271,25 @@ fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_a_battery_was_off_by_is_told_if_it_matters() {
+        let found = |resistance, soc_shift| {
+            let nuisance = Nuisance {
+                resistance,
+                soc_shift,
+                ..Nuisance::default()
+            };
+            base_found("v_cell_v", nuisance)
+        };
+        assert_eq!(found(4e-4, -4e-4), None);
+        let said = found(0.273, -0.0071).unwrap();
+        assert!(said.contains("resistance 27.3 % higher and"), "{said}");
+        assert!(
+            said.contains("start 0.710 points of per cent lower"),
+            "{said}"
+        );
+    }
 
     #[test]
     fn what_a_recording_does_not_tell_is_told_from_what_it_does() {
