@@ -39,7 +39,7 @@ const FLASH_SPI: spi::Settings = spi::Settings {
     baud: 0,
 };
 /// For its clock and data: as they come out of a reset, pins follow 4 MHz, and with this 50 MHz (STM32F405 data sheet,
-/// I/O AC characteristics, 2.7 … 3.6 V). The meter's 2.625 MHz and all else stay below.
+/// I/O AC characteristics, 2.7 … 3.6 V; *assumed*, as in the emulator). The meter's 2.625 MHz and all else stay below.
 const FLASH_EDGES: Speed = Speed::High;
 
 /// The range flag with its interrupt, and the external interrupts' mask that both lines share.

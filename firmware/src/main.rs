@@ -108,7 +108,7 @@ mod app {
 
     /// The flash has so long to deliver its content before the board starts without what is missing: the configuration
     /// comes first, 25 ms after an erase that a reset left running, 400 ms. The state takes 0.1 s more at most, and in
-    /// that case it is in RAM as well.
+    /// that case it is in RAM as well. The watchdog bites after 680 ms at the earliest.
     const LOAD_LIMIT_MS: u32 = 450;
     /// Every task has to check in from here on, started or not.
     const START_LIMIT: Duration = Duration::from_ticks(1_000_000);

@@ -918,8 +918,8 @@ fn swap(
     Some((index, best.clone()))
 }
 
-/// The model with an effect, at the index that comes with it, replaced by one of its equals whose equation is exact (a constant, a factor, a time), if the effect's
-/// own is not.
+/// The model with an effect, at the index that comes with it, replaced by one of its equals whose equation is exact (a constant, a
+/// factor, a time), if the effect's own is not.
 fn plainer(
     bench: &Workbench<'_>,
     now: &Fit,
