@@ -970,13 +970,13 @@ mod app {
         center: &mut impl rtic::Mutex<T = Center>,
         administration: &mut impl rtic::Mutex<T = Administration>,
     ) -> bool {
-        let (request, configuration, generation) = administration.lock(|administration| {
-            let store = &administration.store;
-            (administration.request, *store.active(), store.generation())
-        });
-        let done = match request {
+        let done = match administration.lock(|administration| administration.request) {
             None => return false,
             Some(Command::Save) => {
+                let (configuration, generation) = administration.lock(|administration| {
+                    let store = &administration.store;
+                    (*store.active(), store.generation())
+                });
                 let done = storage.save_configuration(&configuration).await;
                 if done {
                     administration.lock(|administration| administration.saved = Some(generation));
@@ -992,6 +992,7 @@ mod app {
                 }),
                 Stored::Nothing | Stored::Refused => false,
             },
+            // Of the three there is only this one left: the log is to be cleared.
             Some(_) => match storage.clear_log_sector().await {
                 Ok(true) => return true,
                 Ok(false) => true,

@@ -197,8 +197,8 @@ pub fn overlap(place: &Place, locations: &[Location], recording: &Table) -> Opti
         .iter()
         .filter_map(|location| {
             let (name, absolute) = match location.variable.as_str() {
-                "abs(i)" => (reference, true),
-                "i" => (reference, false),
+                "abs(i)" | "abs(x)" => (reference, true),
+                "i" | "x" => (reference, false),
                 other => (other, false),
             };
             let said = inside(recording.get(name)?, absolute, location.from, location.to);

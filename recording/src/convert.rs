@@ -172,8 +172,7 @@ pub fn read(path: &Path, options: &Options, progress: &mut dyn FnMut(f64)) -> Re
         format == Format::Candump,
     );
     let counts = log(&source, reader, &mut |frame| decoder.frame(frame))?;
-    decoder.check_bus()?;
-    let (series, decoded) = decoder.finish();
+    let (series, decoded) = decoder.finish()?;
     Ok(Converted {
         format,
         counts: Some((counts, decoded)),
@@ -191,8 +190,7 @@ fn from_mdf(source: &str, bytes: &[u8], options: &Options) -> Result<Converted> 
         let database = database(source, Format::Mdf, options)?;
         let mut decoder = Decoder::new(database, source, options.bus.as_deref(), false);
         contents.frames.give(&mut |frame| decoder.frame(frame))?;
-        decoder.check_bus()?;
-        let (decoded_series, decoded) = decoder.finish();
+        let (decoded_series, decoded) = decoder.finish()?;
         series.extend(decoded_series);
         counts = Some((contents.counts, decoded));
     }

@@ -495,7 +495,7 @@ impl<'a> Decoder<'a> {
     }
 
     /// The bus that was chosen had frames, if any had.
-    pub fn check_bus(&self) -> Result<()> {
+    fn check_bus(&self) -> Result<()> {
         let Some(bus) = self.bus.as_ref().filter(|_| !self.met) else {
             return Ok(());
         };
@@ -512,8 +512,10 @@ impl<'a> Decoder<'a> {
         ))
     }
 
-    /// The signals, a series for each message that was received, and what else there was.
-    pub fn finish(self) -> (Vec<Series>, Decoded) {
+    /// The signals, a series for each message that was received, and what else there was; an error if the bus that was chosen
+    /// had no frame, and others had.
+    pub fn finish(self) -> Result<(Vec<Series>, Decoded)> {
+        self.check_bus()?;
         let mut collected = self.collected;
         let mut series = Vec::new();
         for id in self.order {
@@ -541,7 +543,7 @@ impl<'a> Decoder<'a> {
                 signals,
             });
         }
-        (series, self.counts)
+        Ok((series, self.counts))
     }
 }
 

@@ -330,7 +330,7 @@ fn decode_with(
     log::candump::read("log", log.as_bytes(), &mut |frame: &Frame<'_>| {
         decoder.frame(frame)
     })?;
-    let (series, decoded) = decoder.finish();
+    let (series, decoded) = decoder.finish().unwrap();
     Ok((Merged::new("log", series)?.recording()?, decoded))
 }
 
@@ -439,7 +439,7 @@ fn signals_get_the_names_that_are_asked_for() {
             decoder.frame(frame)
         })
         .unwrap();
-        Merged::new("log", decoder.finish().0).unwrap()
+        Merged::new("log", decoder.finish().unwrap().0).unwrap()
     };
     let mapped = |argument| merged().mapped(&Mapping::parse([argument]).unwrap());
     // With the unit's ending or without, and with its sign turned.
@@ -521,7 +521,7 @@ fn units_of_editors_that_write_latin_1_are_known() {
         decoder.frame(frame)
     })
     .unwrap();
-    let read = Merged::new("log", decoder.finish().0)
+    let read = Merged::new("log", decoder.finish().unwrap().0)
         .unwrap()
         .recording()
         .unwrap();
@@ -614,7 +614,7 @@ proptest! {
         decoder.frame(&Frame {
             time_ns: 0, bus: "0", id: 16, extended: false, length, data: kept, place: Default::default(),
         }).unwrap();
-        let (series, decoded) = decoder.finish();
+        let (series, decoded) = decoder.finish().unwrap();
         let value = series[0].signals[0].values[0];
         let mut short = [0; 8];
         short.copy_from_slice(&kept);

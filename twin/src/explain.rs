@@ -34,6 +34,8 @@ use workbench::{Member, Model, Workbench};
 
 /// Structure left beside the named effects makes the explanation a partial one from this share of the residual on.
 const LEFT: f64 = 0.04;
+/// What a battery is found to be off by is told from here on, in %.
+const TOLD_PERCENT: f64 = 0.1;
 /// A mismatch that no effect explains is one from this share within reach of the inputs on.
 const STRUCTURE: f64 = 0.1;
 /// What remains is too loud from this multiple of the stated noise on.
@@ -357,9 +359,6 @@ fn decide(
         beside,
     }
 }
-
-/// What a battery is found to be off by is told from here on, in %.
-const TOLD_PERCENT: f64 = 0.1;
 
 fn jumps(residual: &[f64]) -> Vec<f64> {
     residual.windows(2).map(|pair| pair[1] - pair[0]).collect()
@@ -1098,7 +1097,7 @@ fn effects(bench: &Workbench<'_>, selection: &Selection, beside: f64) -> Vec<Eff
             EffectReport {
                 id: card.id.to_owned(),
                 signal: bench.problem.name.clone(),
-                statement: card.statement.to_owned(),
+                statement: statement(card.statement, &bench.problem.unit),
                 equation: card.equation.to_owned(),
                 parameters,
                 held_out_gain: named.held_out_gain,
@@ -1109,6 +1108,15 @@ fn effects(bench: &Workbench<'_>, selection: &Selection, beside: f64) -> Vec<Eff
             }
         })
         .collect()
+}
+
+/// What an effect does, in words of the signal's unit: the library is written for currents.
+fn statement(of_currents: &str, unit: &str) -> String {
+    if unit == "A" {
+        of_currents.to_owned()
+    } else {
+        of_currents.replace("every current", "every value")
+    }
 }
 
 fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> SignalPlots {

@@ -95,21 +95,22 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             out.display()
         )));
     }
-    let refuse = |file: Option<(&str, &Path)>| {
-        let mut written = FILES.iter().map(|name| out.join(name));
-        written.try_for_each(|written| overwrite::refuse(&written, file))
-    };
-    let read = [
-        ("--model", &arguments.model),
-        ("--recording", &arguments.recording),
+    let mut read = vec![
+        ("--model", arguments.model.as_path()),
+        ("--recording", arguments.recording.as_path()),
     ];
-    let reference = arguments.reference.iter().map(|path| ("--reference", path));
-    let holdout = arguments.holdout.iter().map(|path| ("--holdout", path));
-    for (argument, path) in read.into_iter().chain(reference).chain(holdout) {
-        refuse(Some((argument, path)))?;
-    }
+    let reference = arguments.reference.iter();
+    read.extend(reference.map(|path| ("--reference", path.as_path())));
+    let holdout = arguments.holdout.iter();
+    read.extend(holdout.map(|path| ("--holdout", path.as_path())));
+    let refuse = |read: &[(&str, &Path)]| {
+        FILES
+            .iter()
+            .try_for_each(|name| overwrite::refuse(&out.join(name), read.iter().copied()))
+    };
+    refuse(&read)?;
     let model = Model::read(&arguments.model)?;
-    refuse(model.ocv_file())?;
+    refuse(model.ocv_file().as_slice())?;
     let reading = Progress::new(format!("reading {}", arguments.recording.display()));
     let inputs = Inputs {
         recording: arguments.recording.clone(),
@@ -157,7 +158,6 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     drop(explaining);
     remarks.append(&mut report.remarks);
     report.remarks = remarks;
-    report.name_values();
     report.inputs = data::Inputs {
         model: arguments.model.display().to_string(),
         recording: arguments.recording.display().to_string(),

@@ -108,6 +108,9 @@ impl Spi {
         }
     }
 
+    /// Offset of the data register.
+    pub const DATA: u32 = 4 * DR as u32;
+
     /// What divides the clock of its APB.
     pub const fn divider(&self) -> u64 {
         2 << ((self.cr1 & BR) >> 3)

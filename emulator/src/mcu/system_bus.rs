@@ -225,22 +225,19 @@ impl State {
             Block::Usart2 => call!(self, now, usart2.write(offset, bytes, value)),
             Block::Can1 => call!(self, now, can.write(offset, bytes, value)),
         }?;
-        if block == Block::Rcc {
-            self.follow_rcc(now)?;
+        match block {
+            Block::Rcc => self.follow_rcc(now),
+            Block::Spi1 | Block::Spi2 if offset == Spi::DATA => self.check_edges(block),
+            _ => Ok(()),
         }
-        self.check_edges(block, offset)
     }
 
     /// Clock and data of an SPI master that sends have to be able to follow its clock: real pins would round the edges off.
-    fn check_edges(&self, block: Block, offset: u32) -> Result<(), Unmodelled> {
-        const SPI_DR: u32 = 0x0C;
-        if offset != SPI_DR {
-            return Ok(());
-        }
-        let (spi, clock, port, pins) = match block {
-            Block::Spi1 => (&self.spi1, self.clocks.apb2, 'A', [5, 7]),
-            Block::Spi2 => (&self.spi2, self.clocks.apb1, 'B', [13, 15]),
-            _ => return Ok(()),
+    fn check_edges(&self, block: Block) -> Result<(), Unmodelled> {
+        let (spi, clock, port, pins) = if block == Block::Spi1 {
+            (&self.spi1, self.clocks.apb2, 'A', [5, 7])
+        } else {
+            (&self.spi2, self.clocks.apb1, 'B', [13, 15])
         };
         let clock_hz = u64::from(clock) / spi.divider();
         for pin in pins {

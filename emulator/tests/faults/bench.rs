@@ -91,6 +91,12 @@ pub fn charge_c(rig: &Rig<'_>) -> f64 {
     rig.view.charge_c().value.expect("a charge on CAN")
 }
 
+/// What the board declares its charge to be off by at most, in C.
+pub fn charge_bound_c(rig: &Rig<'_>) -> f64 {
+    let bound_c = rig.view.signal("MeterCurrent", "ChargeUncertainty");
+    bound_c.unwrap()
+}
+
 /// What the board has counted too much, in C, since `from` (its charge and the true one then).
 pub fn charge_error_c(rig: &mut Rig<'_>, from: (f64, f64)) -> f64 {
     let counted_c = charge_c(rig) - from.0;

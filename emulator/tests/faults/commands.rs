@@ -112,10 +112,7 @@ fn fault_f26_range_changes_during_calibration_save_and_bus_errors() {
         strike(&mut rig, "F5");
         rig.run_s(3.3).unwrap();
         let error_c = charge_error_c(&mut rig, before);
-        let declared_c = rig
-            .view
-            .signal("MeterCurrent", "ChargeUncertainty")
-            .unwrap();
+        let declared_c = charge_bound_c(&rig);
         println!(
             "F26 at {current_a} A: {} edges, error {:+.1} mC, declared {:.1} mC, {:?}",
             rig.truth().edges,

@@ -124,10 +124,7 @@ fn fault_f24_the_board_is_back_after_a_hang_or_fault_with_its_charge_and_the_cau
         let said = rig.view.signal("Identity", "ResetCause");
         rig.run_s(5.0).unwrap();
         let error_c = charge_error_c(&mut rig, before);
-        let declared_c = rig
-            .view
-            .signal("MeterCurrent", "ChargeUncertainty")
-            .unwrap();
+        let declared_c = charge_bound_c(&rig);
         println!(
             "F24 {fault}: reset by {:?} after {:.0} ms, valid current {:.0} ms later, cause {said:?} on CAN after {:.0} ms; \
              charge {:+.2} C, declared {declared_c:.1} C",

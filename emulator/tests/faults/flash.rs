@@ -226,10 +226,7 @@ fn fault_f19_a_cut_off_state_costs_one_save_interval() {
         rig.run_s(0.3).unwrap();
         let error_c = charge_error_c(&mut rig, before);
         worst_c = worst_c.max(error_c.abs());
-        let declared_c = rig
-            .view
-            .signal("MeterCurrent", "ChargeUncertainty")
-            .unwrap();
+        let declared_c = charge_bound_c(&rig);
         if error_c.abs() > declared_c {
             beyond.push((*bytes, error_c, declared_c));
         }
@@ -338,10 +335,7 @@ fn fault_f21_a_loss_of_power_costs_no_more_than_is_declared() {
         });
         rig.run_s(0.5).unwrap();
         let error_c = charge_error_c(&mut rig, before);
-        let declared_c = rig
-            .view
-            .signal("MeterCurrent", "ChargeUncertainty")
-            .unwrap();
+        let declared_c = charge_bound_c(&rig);
         println!(
             "F21 at {current_a} A after {before_c:.0} C: valid after {:.0} ms, charge {error_c:+.1} C, declared {declared_c} C, \
              {:?}",
@@ -432,10 +426,7 @@ fn fault_f21_after_resets_the_flash_still_follows_the_counter() {
     rig.view = Default::default();
     rig.run_s(0.6).unwrap();
     let error_c = charge_error_c(&mut rig, before);
-    let declared_c = rig
-        .view
-        .signal("MeterCurrent", "ChargeUncertainty")
-        .unwrap();
+    let declared_c = charge_bound_c(&rig);
     println!(
         "F21 after four resets: charge {error_c:+.1} C, declared {declared_c} C of the last start alone"
     );
@@ -459,10 +450,7 @@ fn fault_f21_the_declared_loss_is_that_of_the_policy_in_force() {
         rig.view = Default::default();
         rig.run_s(0.6).unwrap();
         let error_c = charge_error_c(&mut rig, before);
-        let declared_c = rig
-            .view
-            .signal("MeterCurrent", "ChargeUncertainty")
-            .unwrap();
+        let declared_c = charge_bound_c(&rig);
         println!("F21 interval {interval_c} C: charge {error_c:+.1} C, declared {declared_c} C");
         assert!(error_c.abs() <= declared_c, "{error_c} {declared_c}");
         // The interval, and a second at 600 A.

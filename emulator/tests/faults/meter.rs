@@ -188,10 +188,7 @@ fn fault_f05_a_reset_of_the_meter_costs_no_more_than_is_declared() {
             .map(|transfer| transfer.start_s - struck_s)
             .unwrap();
         let error_c = charge_error_c(&mut rig, before);
-        let uncertainty_c = rig
-            .view
-            .signal("MeterCurrent", "ChargeUncertainty")
-            .unwrap();
+        let uncertainty_c = charge_bound_c(&rig);
         println!(
             "F5 at {current_a} A, AENERGY {energy}: set up again from {:.1} ms, on CAN after {:.0} ms; error {:.1} mC, \
              declared {:.1} mC",

@@ -112,7 +112,7 @@ impl<'a> Chain<'a> {
 
     /// What the simulation says at each observed row; NaN where the drive does not reach.
     pub fn run(&self, members: &Members<'_>, nuisance: Nuisance) -> Vec<f64> {
-        self.run_with_noise(members, nuisance, std::iter::empty())
+        self.run_with_noise(members, nuisance, None)
     }
 
     /// The same with noise of the sensor, one value for each observed row, ahead of what ends the chain (steps, thresholds,
@@ -121,22 +121,20 @@ impl<'a> Chain<'a> {
         &self,
         members: &Members<'_>,
         nuisance: Nuisance,
-        mut noise: impl Iterator<Item = f64>,
+        mut noise: Option<&mut dyn Iterator<Item = f64>>,
     ) -> Vec<f64> {
         let links = self.links(members);
         let mut scene = self.start.clone();
         for link in links {
             self.apply(&mut scene, link, nuisance);
-            if matches!(link, Link::Beside) {
-                // None: the series stays shared.
-                let mut noise = noise.by_ref().peekable();
-                if noise.peek().is_some() {
-                    scene
-                        .signal
-                        .iter_mut()
-                        .zip(noise)
-                        .for_each(|(value, noise)| *value += noise);
-                }
+            if matches!(link, Link::Beside)
+                && let Some(noise) = noise.take()
+            {
+                scene
+                    .signal
+                    .iter_mut()
+                    .zip(noise)
+                    .for_each(|(value, noise)| *value += noise);
             }
         }
         scene.signal.into_vec()

@@ -454,12 +454,18 @@ impl<'a> Cursor<'a> {
             // Of a straight line it is the value in the middle.
             return self.value(series, 0.5 * (from + to), held);
         }
-        let mut sum = -self.beyond(series, from, held);
-        while self.at + 1 < self.rows.end && self.t_s[self.at + 1] <= to {
+        let sum = self.walk(-self.beyond(series, from, held), series, to, held);
+        (sum + self.beyond(series, to, held)) / (to - from)
+    }
+
+    /// Goes on to the last row not after a time; a sum, with the integral over what was passed.
+    #[inline]
+    fn walk(&mut self, mut sum: f64, series: &[f64], t: f64, held: bool) -> f64 {
+        while self.at + 1 < self.rows.end && self.t_s[self.at + 1] <= t {
             sum += area(self.t_s, series, self.at, held);
             self.at += 1;
         }
-        (sum + self.beyond(series, to, held)) / (to - from)
+        sum
     }
 
     /// Integral from the row where the cursor stands to a time before the next one, or beyond the ends.
@@ -488,29 +494,18 @@ pub fn boxcar(
     if window_s.is_nan() || window_s <= 0.0 {
         return output;
     }
-    for rows in segments {
-        let (t, x) = (&t_s[rows.clone()], &input[rows.clone()]);
-        // The row that the window begins after (times go forward within a segment), and the integral up to it.
-        let (mut at, mut before) = (0, 0.0);
-        // The integral up to the row where it ends.
-        let mut until = 0.0;
-        for (row, out) in output[rows.clone()].iter_mut().enumerate() {
-            if row > 0 {
-                until += area(t, x, row - 1, held);
+    for rows in segments.iter().filter(|rows| !rows.is_empty()) {
+        // Where the window begins (times go forward within a segment), and the integrals up to there and up to its end.
+        let mut begin = Cursor::new(t_s, rows.clone());
+        let (mut before, mut until) = (0.0, 0.0);
+        for row in rows.clone() {
+            if row > rows.start {
+                until += area(t_s, input, row - 1, held);
             }
-            let begin = t[row] - window_s;
-            while at + 1 < t.len() && t[at + 1] <= begin {
-                before += area(t, x, at, held);
-                at += 1;
-            }
-            let h = begin - t[at];
-            let start = if h <= 0.0 || held || at + 1 >= t.len() {
-                before + x[at] * h
-            } else {
-                let end = x[at] + (x[at + 1] - x[at]) * (h / (t[at + 1] - t[at]));
-                before + 0.5 * (x[at] + end) * h
-            };
-            *out = (until - start) / window_s;
+            let from = t_s[row] - window_s;
+            before = begin.walk(before, input, from, held);
+            let start = before + begin.beyond(input, from, held);
+            output[row] = (until - start) / window_s;
         }
     }
     output

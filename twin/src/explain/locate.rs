@@ -42,14 +42,20 @@ pub fn variables(bench: &Workbench<'_>) -> Vec<Variable> {
         "A".to_owned()
     };
     let x = &bench.reference;
+    // What is no current is not called one.
+    let [size, itself, rate_of] = if unit == "A" {
+        ["abs(i)", "i", "abs(di/dt)"]
+    } else {
+        ["abs(x)", "x", "abs(dx/dt)"]
+    };
     let mut variables = vec![
         Variable {
-            name: "abs(i)",
+            name: size,
             unit: unit.clone(),
             values: x.iter().map(|x| x.abs()).collect(),
         },
         Variable {
-            name: "i",
+            name: itself,
             unit: unit.clone(),
             values: x.clone(),
         },
@@ -62,7 +68,7 @@ pub fn variables(bench: &Workbench<'_>) -> Vec<Variable> {
         }
     }
     variables.push(Variable {
-        name: "abs(di/dt)",
+        name: rate_of,
         unit: format!("{unit}/s"),
         values: rate,
     });

@@ -180,7 +180,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
             0.85,
             "trying to do without each effect, and with others in its place",
         );
-        if let Some(leaner) = backward(bench, &now, (&step_p99, 1), &mut decisions) {
+        if let Some(leaner) = backward(bench, &now, &step_p99, 1, &mut decisions) {
             now = leaner;
         }
         let others = swapped(bench, &now);
@@ -196,7 +196,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                 let mut now = polish(bench, &now);
                 let mut others = others;
                 // The last exchange may have made another one needless.
-                if let Some(leaner) = backward(bench, &now, (&step_p99, 1), &mut decisions) {
+                if let Some(leaner) = backward(bench, &now, &step_p99, 1, &mut decisions) {
                     now = polish(bench, &leaner);
                     others = swapped(bench, &now);
                 }
@@ -213,15 +213,14 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                     ));
                     now = polish(bench, &plainer);
                     // What only made up for the other equation goes with it.
-                    if let Some(leaner) = backward(bench, &now, (&step_p99, 1), &mut decisions) {
+                    if let Some(leaner) = backward(bench, &now, &step_p99, 1, &mut decisions) {
                         now = polish(bench, &leaner);
                     }
                     others = swapped(bench, &now);
                     named = name(bench, &now, &others, &step_p99);
                 }
                 // Only now that nothing is exchanged any more does each have to be missed, not the least alone.
-                if let Some(leaner) =
-                    backward(bench, &now, (&step_p99, MOST_EFFECTS), &mut decisions)
+                if let Some(leaner) = backward(bench, &now, &step_p99, MOST_EFFECTS, &mut decisions)
                 {
                     now = polish(bench, &leaner);
                     others = swapped(bench, &now);
@@ -772,7 +771,8 @@ fn inherit(step_p99: &mut Vec<(&'static str, f64)>, before: &Fit, index: usize, 
 fn backward(
     bench: &Workbench<'_>,
     now: &Fit,
-    (step_p99, looked_at): (&[(&'static str, f64)], usize),
+    step_p99: &[(&'static str, f64)],
+    looked_at: usize,
     decisions: &mut Vec<String>,
 ) -> Option<Fit> {
     let mut leaner: Option<Fit> = None;

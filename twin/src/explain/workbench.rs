@@ -319,12 +319,12 @@ impl<'a> Workbench<'a> {
     /// the simulation: a reading near a threshold jumps by noise, and a stepped one has the steps twice.
     pub fn noise_energy(&self, model: &Model, predicted: &[f64], deviation: f64, seed: u64) -> f64 {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
-        let noise = StandardNormal
+        let mut noise = StandardNormal
             .sample_iter(&mut random)
             .map(|value: f64| deviation * value);
         let noisy = self
             .chain
-            .run_with_noise(&members(model), model.nuisance, noise);
+            .run_with_noise(&members(model), model.nuisance, Some(&mut noise));
         self.thinned(noisy)
             .iter()
             .zip(predicted)

@@ -91,13 +91,15 @@ fn shown(t_s: f64) -> f64 {
     (t_s * 1e6).round() / 1e6
 }
 
-/// The reference at each reading that counts, and the reading.
+/// The reference at each reading that counts, and the reading; `but` are rows, in order, that are left out.
 fn beside<'a>(
     drive: &'a Drive,
     observed: &'a Observed,
+    but: &'a [usize],
 ) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
-    let counted = (0..observed.t_s.len()).filter(|row| observed.valid[*row]);
-    counted.map(|row| (reference_at(drive, observed, row), observed.value[row]))
+    (0..observed.t_s.len())
+        .filter(|row| observed.valid[*row] && but.binary_search(row).is_err())
+        .map(|row| (reference_at(drive, observed, row), observed.value[row]))
 }
 
 /// The reference at a reading.
@@ -220,19 +222,24 @@ pub(super) fn wild(drive: &Drive, observed: &Observed) -> Wild {
     let mut at = rows().next();
     while let Some(first) = at {
         at = next(first);
-        let mut window = vec![first];
-        while let Some(row) = next(*window.last().unwrap_or(&first)) {
+        // Two rows around those out there.
+        let mut around = [first; WILD_ROWS + 2];
+        for length in 2..=around.len() {
+            let Some(row) = next(around[length - 2]) else {
+                break;
+            };
             if observed.segment_of(row) != observed.segment_of(first) {
                 break;
             }
-            window.push(row);
-            if window.len() < 3 {
+            around[length - 1] = row;
+            if length < 3 {
                 continue;
             }
-            if jump(&reference, &window) > least {
+            let window = &around[..length];
+            if jump(&reference, window) > least {
                 return Wild::default();
             }
-            let size = jump(&reading, &window);
+            let size = jump(&reading, window);
             let (low, high) = window
                 .iter()
                 .map(|row| reference(*row))
@@ -244,13 +251,12 @@ pub(super) fn wild(drive: &Drive, observed: &Observed) -> Wild {
                     found.between = 0.5 * (reading(first) + reading(row));
                 }
                 found.places += 1;
-                found.rows.extend(&window[1..window.len() - 1]);
+                found.rows.extend(&window[1..length - 1]);
                 at = Some(row);
                 break;
             }
             // Only what already stands out may take longer to come back.
-            let out = (reading(window[1]) - reading(first)).abs() > least;
-            if !out || window.len() == WILD_ROWS + 2 {
+            if (reading(window[1]) - reading(first)).abs() <= least {
                 break;
             }
         }
@@ -261,18 +267,6 @@ pub(super) fn wild(drive: &Drive, observed: &Observed) -> Wild {
     found
 }
 
-/// The pairs without the wild readings.
-fn without<'a>(
-    drive: &'a Drive,
-    observed: &'a Observed,
-    wild: &'a Wild,
-) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
-    let counted = (0..observed.t_s.len()).filter(|row| observed.valid[*row]);
-    counted
-        .filter(|row| wild.rows.binary_search(row).is_err())
-        .map(|row| (reference_at(drive, observed, row), observed.value[row]))
-}
-
 /// Units and signs of a sensor and its reference.
 pub(super) fn pair(
     drive: &Drive,
@@ -281,7 +275,7 @@ pub(super) fn pair(
     source: &str,
     [reference, measured]: [&str; 2],
 ) -> Result<(), Failure> {
-    let pairs = without(drive, observed, wild);
+    let pairs = beside(drive, observed, &wild.rows);
     if pairs.clone().count() < FEWEST_ROWS {
         return Ok(());
     }
@@ -320,11 +314,11 @@ pub(super) fn plausible(
     [reference, measured]: [&str; 2],
 ) -> Vec<String> {
     let mut remarks = Vec::new();
-    let pairs = beside(drive, observed);
+    let pairs = beside(drive, observed, &[]);
     if pairs.clone().count() < FEWEST_ROWS {
         return remarks;
     }
-    let together = correlation(without(drive, observed, wild));
+    let together = correlation(beside(drive, observed, &wild.rows));
     if together.abs() < UNRELATED {
         remarks.push(format!(
             "{measured} does not follow {reference} (correlation {together:.2}): the reference may be that of another conductor"
@@ -469,7 +463,7 @@ pub(super) fn battery(
     base: &BatteryBase,
     [source, name, current]: [&str; 3],
 ) -> Result<(), Failure> {
-    let pairs = beside(drive, observed);
+    let pairs = beside(drive, observed, &[]);
     if pairs.clone().count() < FEWEST_ROWS {
         return Ok(());
     }

@@ -58,44 +58,6 @@ pub struct Report {
     pub plots: Vec<SignalPlots>,
 }
 
-impl Report {
-    /// Calls the reference `x` where it is no current, and what is said of currents a value: the library is written for
-    /// currents.
-    pub fn name_values(&mut self) {
-        let variable = |name: &str, unit: &str| match (name, unit) {
-            (_, "A" | "A/s") => None,
-            ("abs(i)", _) => Some("abs(x)"),
-            ("i", _) => Some("x"),
-            ("abs(di/dt)", _) => Some("abs(dx/dt)"),
-            _ => None,
-        };
-        let left = self.unexplained.iter_mut();
-        let left = left.filter_map(|left| left.location.as_mut());
-        for location in self.locations.iter_mut().chain(left) {
-            if let Some(name) = variable(&location.variable, &location.unit) {
-                location.variable = name.to_owned();
-            }
-        }
-        let plots = self.plots.iter_mut();
-        for (with_unit, _) in plots.flat_map(|plots| &mut plots.variables) {
-            if let Some((name, unit)) = with_unit.split_once(" / ")
-                && let Some(name) = variable(name, unit)
-            {
-                *with_unit = format!("{name} / {unit}");
-            }
-        }
-        for effect in &mut self.effects {
-            let signal = self
-                .signals
-                .iter()
-                .find(|signal| signal.name == effect.signal);
-            if signal.is_some_and(|signal| signal.unit != "A") {
-                effect.statement = effect.statement.replace("every current", "every value");
-            }
-        }
-    }
-}
-
 /// What was fitted to one signal.
 #[derive(Clone, Debug, Default)]
 pub struct FittedModel {

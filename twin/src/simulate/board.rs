@@ -241,26 +241,20 @@ impl Board {
             range_high: vec![f64::NAN; rows],
             fresh: vec![false; rows],
         };
-        let mut row = 0;
         let mut counted_before_c = 0.0;
-        while row < rows {
-            let segment = observed.segment_of(row);
-            let end = (row..rows)
-                .find(|next| observed.segment_of(*next) != segment)
-                .unwrap_or(rows);
+        for (segment, these) in observed.stretches.iter() {
             if let Some(inside) = drive
                 .segments
                 .get(segment)
                 .filter(|inside| !inside.is_empty())
             {
                 let pieces = self.pieces(drive, inside.clone(), held);
-                self.convert(&pieces, observed, row..end, pace, &mut reported);
+                self.convert(&pieces, observed, these.clone(), pace, &mut reported);
                 if charge {
                     counted_before_c =
-                        self.count(&pieces, observed, row..end, counted_before_c, &mut reported);
+                        self.count(&pieces, observed, these, counted_before_c, &mut reported);
                 }
             }
-            row = end;
         }
         reported
     }
