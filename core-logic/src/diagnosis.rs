@@ -208,7 +208,7 @@ diagnoses! {
     30 Rs485Errors: "Requests on RS485 are damaged.",
         "CRC, parity or framing errors since the last look";
         0 ms, 5000 ms, Info, WhileActive, [] [] []
-    31 FlashFault: "A write, erase or check of the flash failed.",
+    31 FlashFault: "A write, erase or check of the flash failed, or a stored record is damaged or was cut off.",
         "any failure after retries";
         0 ms, 0 ms, Error, UntilCleared, [] [] []
     32 ConfigurationDefault: "The stored configuration was refused; defaults are in use.",

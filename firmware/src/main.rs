@@ -829,7 +829,7 @@ mod app {
         let now = time::now();
 
         let configuration = cx.shared.administration.lock(|administration| {
-            if let Stored::Value(configuration) = &stored {
+            if let Stored::Value(configuration) | Stored::Older(configuration) = &stored {
                 // It was checked when it was decoded.
                 let _ = administration.store.commit(*configuration);
                 administration.saved = Some(administration.store.generation());
@@ -949,9 +949,13 @@ mod app {
                 start.slots = slots;
                 start.loss = identity::loss_over_reset(previous);
             }
-            (Err(_), Stored::Value(state)) => {
+            (Err(_), Stored::Value(state) | Stored::Older(state)) => {
                 start.state = Some(*state);
                 start.loss = identity::loss_over_power_off(policy);
+                if matches!(stored, Stored::Older(_)) {
+                    // A save interval more.
+                    start.loss = start.loss.saturating_add(start.loss);
+                }
                 start.is_in_flash = true;
             }
             (Err(_), Stored::Refused) => {
@@ -984,12 +988,14 @@ mod app {
                 done
             }
             Some(Command::Restore) => match storage.configuration().await {
-                Stored::Value(configuration) => administration.lock(|administration| {
-                    let store = &mut administration.store;
-                    let done = store.commit(configuration).is_ok();
-                    administration.saved = Some(store.generation());
-                    done
-                }),
+                Stored::Value(configuration) | Stored::Older(configuration) => {
+                    administration.lock(|administration| {
+                        let store = &mut administration.store;
+                        let done = store.commit(configuration).is_ok();
+                        administration.saved = Some(store.generation());
+                        done
+                    })
+                }
                 Stored::Nothing | Stored::Refused => false,
             },
             // Of the three there is only this one left: the log is to be cleared.

@@ -63,10 +63,22 @@ fn count(counter: &mut u32) {
 pub enum Stored<T> {
     /// This.
     Value(T),
+    /// This, and something newer that is damaged or was cut off.
+    Older(T),
     /// Nothing yet.
     Nothing,
     /// Something that must not be used, or the flash could not be read.
     Refused,
+}
+
+impl<T> Stored<T> {
+    fn read(value: T, is_older: bool) -> Self {
+        if is_older {
+            Self::Older(value)
+        } else {
+            Self::Value(value)
+        }
+    }
 }
 
 /// The flash with its regions.
@@ -126,8 +138,8 @@ impl Storage {
     /// The stored configuration.
     pub async fn configuration(&mut self) -> Stored<Configuration> {
         match self.newest(CONFIGURATION).await {
-            Ok(Some(bytes)) => match configuration::decode(bytes) {
-                Ok(configuration) => Stored::Value(configuration),
+            Ok(Some((bytes, is_older))) => match configuration::decode(bytes) {
+                Ok(configuration) => Stored::read(configuration, is_older),
                 Err(error) => {
                     self.refuse(&error);
                     Stored::Refused
@@ -155,8 +167,8 @@ impl Storage {
     /// The stored charge and state of charge.
     pub async fn state(&mut self) -> Stored<RetainedState> {
         match self.newest(STATE).await {
-            Ok(Some(bytes)) => match RetainedState::decode(bytes) {
-                Ok(state) => Stored::Value(state),
+            Ok(Some((bytes, is_older))) => match RetainedState::decode(bytes) {
+                Ok(state) => Stored::read(state, is_older),
                 Err(error) => {
                     defmt::error!("stored state refused: {}", error);
                     count(&mut self.counters.refused);
@@ -168,14 +180,15 @@ impl Storage {
         }
     }
 
-    async fn newest(&mut self, region: Range<u32>) -> Result<Option<&[u8]>, ()> {
+    /// The region's newest intact record, and whether it is older than one that is not intact.
+    async fn newest(&mut self, region: Range<u32>) -> Result<Option<(&[u8], bool)>, ()> {
         let (Ok(config), true) = (QueueConfig::try_new(region.clone()), self.ready) else {
             return Err(());
         };
         let mut queue = QueueStorage::new(&mut self.flash, config, Cache::new_uncached());
         let mut length = None;
         let mut items = queue.iter().await.map_err(|error| log(&error))?;
-        // A record that was cut off by a loss of power has a wrong CRC and is passed over.
+        // A record that is damaged or was cut off by a loss of power has a wrong CRC: it is read, and passed over.
         while let Some(item) = items
             .next(&mut self.buffer)
             .await
@@ -193,7 +206,17 @@ impl Storage {
             self.failed = true;
             return Err(());
         }
-        Ok(length.and_then(|length| self.record.get(..length)))
+        let Some((record, last_read)) =
+            length.and_then(|length| self.record.get(..length).zip(self.buffer.get(..length)))
+        else {
+            return Ok(None);
+        };
+        let is_older = last_read != record;
+        if is_older {
+            count(&mut self.counters.refused);
+            self.failed = true;
+        }
+        Ok(Some((record, is_older)))
     }
 
     /// The region's first sector that was written, or cannot be read; its end without one.

@@ -58,7 +58,7 @@ fn fault_f01_flipped_bits_cost_no_charge_and_are_counted() {
 }
 
 #[test]
-fn fault_f02_compensating_flips_are_rejected_or_undone_by_the_next_reading() {
+fn fault_f02_compensating_flips_are_rejected_or_taken_back() {
     let mut rig = pulse(50.0, 3.0);
     let before = charges_c(&mut rig);
     rig.run_s(0.3).unwrap();
@@ -74,8 +74,8 @@ fn fault_f02_compensating_flips_are_rejected_or_undone_by_the_next_reading() {
     let error_c = charge_error_c(&mut rig, before);
     let flipped = board(&mut rig, |board| board.meter.flipped_bits());
     let rejected = counters(&mut rig, 0x0106, 1)[0];
-    // What cannot be told from a current is a change that the fastest current makes in one poll, 1.2 · 8,949 counts/s for 20 ms.
-    // It stays where the next reading, which would undo it, is itself refused and the meter starts anew: docs/faults.md.
+    // What cannot be told from a current is a change that the fastest current makes in one poll, 1.2 · 8,949 counts/s for 20 ms,
+    // either way. The next readings take it back: docs/faults.md.
     let bound_c = 2.0 * 1.2 * full_scale_a(Range::Small) * 0.02;
     println!(
         "F2: {flipped} bits, {rejected} readings rejected, {:.1} mC off for one poll, {:.1} mC in the end (bound {:.0})",
@@ -86,7 +86,7 @@ fn fault_f02_compensating_flips_are_rejected_or_undone_by_the_next_reading() {
     assert_eq!(flipped, 48);
     assert!(rejected >= 10, "{rejected}");
     assert!(worst_c <= bound_c, "{worst_c}");
-    assert!(error_c.abs() <= bound_c, "{error_c}");
+    assert!(error_c.abs() <= 2.0 * quantum_c(Range::Small), "{error_c}");
 }
 
 #[test]
@@ -165,9 +165,16 @@ fn fault_f04_the_gap_before_a_read_is_never_too_short() {
 
 #[test]
 fn fault_f05_a_reset_of_the_meter_costs_no_more_than_is_declared() {
-    // The second is a step right before.
-    let far = [(50.0, 2.0), (50.0, 0.02), (-30.0, 0.7), (300.0, 0.8)]
-        .map(|(current_a, before_s)| (current_a, before_s, 0));
+    // Three of them right behind a step, which the mean that bridges the gap does not contain, or not all of it.
+    let far = [
+        (50.0, 2.0),
+        (50.0, 0.02),
+        (50.0, 0.1),
+        (300.0, 0.25),
+        (-30.0, 0.7),
+        (300.0, 0.8),
+    ]
+    .map(|(current_a, before_s)| (current_a, before_s, 0));
     // Near 0 AENERGY falls by less than it may move within a poll; at each of the ten turns of the read-back.
     let near = (0..10).map(|turn| (50.0, 0.4 + 0.02 * f64::from(turn), -2_920 - 149 * turn));
     for (current_a, before_s, preset) in far.into_iter().chain(near) {
@@ -207,13 +214,10 @@ fn fault_f05_a_reset_of_the_meter_costs_no_more_than_is_declared() {
             error_c.abs() <= poll_c + quantum_c(Range::Large),
             "{error_c}"
         );
-        // The mean that bridges the gap still contains what was before the step: docs/faults.md.
-        if before_s >= 0.3 {
-            assert!(
-                error_c.abs() <= uncertainty_c + quantum_c(Range::Large),
-                "{error_c}"
-            );
-        }
+        assert!(
+            error_c.abs() <= uncertainty_c + quantum_c(Range::Large),
+            "{error_c}"
+        );
     }
 }
 
