@@ -347,6 +347,64 @@ fn a_curve_of_another_shape_is_unknown() {
     }
 }
 
+/// A drive of a fifth of the size.
+fn gentle() -> Truth {
+    let mut truth = truth();
+    truth.current_a.iter_mut().for_each(|i| *i *= 0.2);
+    truth
+}
+
+/// Loops of half the largest current, twenty times as high as where the search for a core begins.
+#[test]
+fn a_core_with_wide_and_high_loops() {
+    let truth = gentle();
+    let (remanence_a, coercivity_a) = (11.4, 37.0);
+    let limits = [0.5, 0.75, 1.0, 1.25, 1.5].map(|share| share * coercivity_a);
+    let (mut stops, mut before) = ([0.0f64; 5], 0.0);
+    let reading = truth.current_a.iter().map(|i| {
+        for (stop, limit) in stops.iter_mut().zip(limits) {
+            *stop = (*stop + i - before).clamp(-limit, limit);
+        }
+        before = *i;
+        i - remanence_a * stops.iter().sum::<f64>() / limits.iter().sum::<f64>()
+    });
+    assert_named(
+        &explained(&truth, reading.collect(), 31, &[]),
+        "core-hysteresis",
+        &[("remanence_a", 11.4, 0.1), ("coercivity_a", 37.0, 0.3)],
+    );
+}
+
+/// Noise ahead of a threshold makes readings jump: what a second effect makes of some of them is chance.
+#[test]
+fn nothing_stands_beside_a_dead_band_that_noise_comes_through() {
+    let truth = gentle();
+    for seed in 40..44 {
+        let mut noise = noise(seed, NOISE_A);
+        let seen = truth.current_a.iter().map(|i| i + noise());
+        let reading = seen.map(|x| if x.abs() < 15.0 { 0.0 } else { x }).collect();
+        let report = explained_as_read(&truth, reading, Coloured::default(), seed, &[]);
+        assert_named(&report, "dead-band", &[("threshold_a", 15.0, 0.5)]);
+    }
+}
+
+/// A load that is switched, and a converter of few steps with the noise ahead of it: a soft curve on the mean, and steps all the
+/// same, as the readings show.
+#[test]
+fn steps_that_noise_softens() {
+    let mut truth = truth();
+    let levels_a = [12.0, 118.0, 36.0, 171.0, 55.0, 148.0, 70.0, 7.0, 133.0];
+    for (row, current_a) in truth.current_a.iter_mut().enumerate() {
+        *current_a = levels_a[(row / 7 + row / 61) % levels_a.len()];
+    }
+    let step_a = 15.8;
+    let mut noise = noise(50, NOISE_A);
+    let seen = truth.current_a.iter().map(|i| i + noise());
+    let reading = seen.map(|x| step_a * (x / step_a).round()).collect();
+    let report = explained_as_read(&truth, reading, Coloured::default(), 50, &[]);
+    assert_named(&report, "quantisation", &[("step_a", step_a, 0.1)]);
+}
+
 /// The same loop of a core without a gap, by relays of this test's own: what is kept is the sign of what was large enough.
 #[test]
 fn a_closed_core_is_hysteresis() {

@@ -14,6 +14,7 @@ use rustfft::{Fft, FftPlanner, num_complex::Complex};
 
 use super::fit::{Fit, Solver, TUNING, dot, huber, normal, spread};
 use super::workbench::{Member, Model, Workbench};
+use crate::effects::scene::Scale;
 use crate::effects::{Effect, Search};
 
 /// Placebo draws.
@@ -32,6 +33,8 @@ pub struct Entry {
     pub member: Member,
     /// Squared error that it removes from held-out blocks, as a share of all of it.
     pub gain: f64,
+    /// The same of the error with all of its outliers: what acts in few readings shows there.
+    pub raw_gain: f64,
     /// Loss of the simulation with these very values.
     pub loss: f64,
     columns: Vec<Vec<f64>>,
@@ -44,6 +47,28 @@ impl Entry {
     /// Whether all of its values are searched in steps.
     pub fn fixed(&self) -> bool {
         stepped(self.member.effect)
+    }
+
+    /// The same start with the sizes that the signature has, where there is more to search than sizes: a size that is far off is
+    /// made up for by the rest, which runs away from its start.
+    pub fn sized(&self, scale: &Scale) -> Option<Member> {
+        let effect = self.member.effect;
+        let parameters = effect.card().parameters;
+        let sizes = linear(effect);
+        if sizes.len() != self.columns.len() || sizes.len() == parameters.len() {
+            return None;
+        }
+        let mut member = self.member.clone();
+        for (&p, factor) in sizes.iter().zip(&self.folds.factors(&self.rights)) {
+            let (low, high) = effect.bounds(p, scale);
+            let off = parameters[p].off;
+            let size = (off + factor * (member.values[p] - off)).clamp(low, high);
+            if size == off || !size.is_finite() {
+                return None;
+            }
+            member.values[p] = size;
+        }
+        Some(member)
     }
 }
 
@@ -188,22 +213,24 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
                     .map(|rows| normal(&columns, &weights, &residual, rows.clone()).0)
                     .collect(),
             );
-            let rights: Vec<f64> = thin
-                .blocks
-                .iter()
-                .flat_map(|rows| {
+            let products = |residual: &[f64]| -> Vec<f64> {
+                let blocks = thin.blocks.iter().flat_map(|rows| {
                     let residual = &residual[rows.clone()];
                     columns
                         .iter()
                         .map(|column| dot(&column[rows.clone()], residual))
-                })
-                .collect();
+                });
+                blocks.collect()
+            };
+            let rights = products(&residual);
+            let raw_gain = folds.gain(&products(&whole)) / dot(&whole, &whole).max(1e-300);
             Entry {
                 member: Member {
                     effect: signature.effect,
                     values: signature.values,
                 },
                 gain: folds.gain(&rights) / all,
+                raw_gain,
                 loss: signature.loss,
                 columns,
                 folds,
@@ -291,16 +318,20 @@ pub fn replaced(model: &Model, effect: &'static dyn Effect) -> Model {
     model
 }
 
+/// The parameters that are solved for.
+fn linear(effect: &dyn Effect) -> Vec<usize> {
+    let parameters = effect.card().parameters.iter().enumerate();
+    parameters
+        .filter(|(_, parameter)| parameter.search == Search::Linear)
+        .map(|(index, _)| index)
+        .collect()
+}
+
 /// Values whose simulations span what the candidate can do: one for each linear parameter, the others off; or the values as
 /// they are.
 fn probes(effect: &'static dyn Effect, values: &[f64]) -> Vec<Vec<f64>> {
     let parameters = effect.card().parameters;
-    let linear: Vec<usize> = parameters
-        .iter()
-        .enumerate()
-        .filter(|(_, parameter)| parameter.search == Search::Linear)
-        .map(|(index, _)| index)
-        .collect();
+    let linear = linear(effect);
     if linear.is_empty() {
         return vec![values.to_vec()];
     }
@@ -337,6 +368,21 @@ impl Folds {
             .map(|gram| Solver::new(&(&all - gram), 1e-9))
             .collect();
         Self { grams, others }
+    }
+
+    /// Factors of the columns from all blocks; `rights` as in [`Folds::gain`].
+    fn factors(&self, rights: &[f64]) -> Vec<f64> {
+        let size = self.grams.first().map_or(0, DMatrix::nrows);
+        let mut gram = DMatrix::zeros(size, size);
+        let mut factors = DVector::<f64>::zeros(size);
+        for (one, right) in self.grams.iter().zip(rights.chunks_exact(size.max(1))) {
+            gram += one;
+            for (factor, right) in factors.iter_mut().zip(right) {
+                *factor += right;
+            }
+        }
+        Solver::new(&gram, 1e-9).solve(&mut factors);
+        factors.iter().copied().collect()
     }
 
     /// Σ over blocks of 2·βᵀs − βᵀGβ with β from the other blocks; `rights` are the products s, block by block.

@@ -19,6 +19,8 @@ const FIRSTS: usize = 5;
 const PAIRS: usize = 6;
 /// Starts of each that are fitted.
 const STARTS: usize = 2;
+/// Starts that are fitted besides, because they take most of the error with its outliers.
+const RARE: usize = 2;
 /// A pair is fitted if its start takes this share of what a pair has to take. Of 203 that took enough in the end, all but three
 /// began so (counted once, on 149 cases of the campaign's `--seeds 0`).
 const STARTED: f64 = 0.5;
@@ -30,6 +32,8 @@ const RIVALS: f64 = 0.1;
 const FLOOR: f64 = 0.04;
 /// A smaller one takes away at least this share where it acts.
 const PLACE: f64 = 0.12;
+/// Standard deviations that a gain beside a threshold has to be away from chance, reading by reading.
+const PAIRED: f64 = 3.0;
 /// Standard deviations of the stated noise that an effect has to be away from nothing: one in a thousand recordings has an effect
 /// of some thirty by chance that is 4.2 away.
 pub const CERTAIN: f64 = 4.2;
@@ -39,6 +43,8 @@ const ACTS: f64 = 0.2;
 const CLEAR: f64 = 0.97;
 /// Share of what the best single effect leaves that a pair has to take to be preferred.
 const MUCH: f64 = 0.3;
+/// Share of what the usual starts leave that another one has to take to be preferred.
+const HALF: f64 = 0.5;
 /// So many others that would do as well make an effect nameless if it is small.
 const VAGUE: usize = 3;
 /// Share of the held-out error below which an effect is small.
@@ -150,22 +156,9 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                 "trying every effect of the library",
             );
             let screening = screen(bench, &now, seed.wrapping_add(done as u64), DRAWS);
-            let single = step(bench, &now, &screening, &mut decisions, &mut refused);
-            // Where two effects hide each other, the best single one can be the wrong one: pairs are tried at the beginning, and
-            // whenever nothing passes alone.
-            let double = if now.model.members.is_empty() || single.is_none() {
-                pair(
-                    bench,
-                    &now,
-                    &screening,
-                    single.as_ref().map(|(fit, _)| fit),
-                    &mut decisions,
-                    &mut refused,
-                )
-            } else {
-                None
-            };
-            let Some((better, p99)) = double.or(single) else {
+            let Some((better, p99)) =
+                addition(bench, &now, &screening, &mut decisions, &mut refused)
+            else {
                 break;
             };
             for id in better.model.ids() {
@@ -370,7 +363,35 @@ fn promising(
     }
     chosen
         .into_iter()
-        .map(|entry| replaced(&now.model, entry.member.effect).with(entry.member.clone()))
+        .map(|entry| added(&now.model, entry.member.clone()))
+        .collect()
+}
+
+fn added(model: &Model, member: Member) -> Model {
+    replaced(model, member.effect).with(member)
+}
+
+/// Starts besides: the best of each effect with the sizes that its signature has, and what takes most of the error with its
+/// outliers, for what acts in few readings.
+fn besides(bench: &Workbench<'_>, now: &Fit, entries: &[Entry]) -> Vec<Model> {
+    let mut ids: Vec<(&str, usize)> = Vec::new();
+    let mut members: Vec<Member> = Vec::new();
+    let told = entries
+        .iter()
+        .filter(|entry| !endless(bench, &entry.member));
+    for entry in told.clone() {
+        let id = (entry.member.id(), entry.member.values.len());
+        if !ids.contains(&id) && ids.len() < FITTED {
+            ids.push(id);
+            members.extend(entry.sized(&bench.scale));
+        }
+    }
+    let mut rare: Vec<&Entry> = told.filter(|entry| entry.raw_gain > 0.0).collect();
+    rare.sort_by(|a, b| b.raw_gain.total_cmp(&a.raw_gain));
+    members.extend(rare.iter().take(RARE).map(|entry| entry.member.clone()));
+    members
+        .into_iter()
+        .map(|member| added(&now.model, member))
         .collect()
 }
 
@@ -382,15 +403,54 @@ fn fits(bench: &Workbench<'_>, models: Vec<Model>) -> Vec<Fit> {
         .collect()
 }
 
-/// The best single addition, if it is accepted.
-fn step(
+/// The effect, or the two, with which a model grows, and the limit that the placebos set.
+fn addition(
     bench: &Workbench<'_>,
     now: &Fit,
     screening: &Screening,
     decisions: &mut Vec<String>,
     refused: &mut Vec<String>,
 ) -> Option<(Fit, f64)> {
-    let models = promising(bench, now, &screening.entries, FITTED, STARTS);
+    let (mut said, mut said_besides) = (Vec::new(), Vec::new());
+    let usual = promising(bench, now, &screening.entries, FITTED, STARTS);
+    let single = step(bench, now, usual, screening, &mut said, refused);
+    // Where two effects hide each other, the best single one can be the wrong one: pairs are tried at the beginning, and
+    // whenever nothing passes alone.
+    let double = if now.model.members.is_empty() || single.is_none() {
+        let single = single.as_ref().map(|(fit, _)| fit);
+        pair(bench, now, screening, single, &mut said, refused)
+    } else {
+        None
+    };
+    let found = double.or(single);
+    let others = besides(bench, now, &screening.entries);
+    let other = step(bench, now, others, screening, &mut said_besides, refused);
+    let is_better = match (&found, &other) {
+        (Some((found, _)), Some((other, _))) => {
+            // One that does as well as two is better.
+            let fewer = other.model.members.len() < found.model.members.len();
+            share(bench, found, other) > if fewer { 0.0 } else { HALF }
+        }
+        _ => found.is_none(),
+    };
+    if is_better {
+        decisions.append(&mut said_besides);
+        other
+    } else {
+        decisions.append(&mut said);
+        found
+    }
+}
+
+/// The best single addition of some, if it is accepted.
+fn step(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    models: Vec<Model>,
+    screening: &Screening,
+    decisions: &mut Vec<String>,
+    refused: &mut Vec<String>,
+) -> Option<(Fit, f64)> {
     let fits = fits(bench, models);
     let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
     let mut ranked: Vec<(Fit, f64)> = fits
@@ -406,11 +466,17 @@ fn step(
         .into_iter()
         .take_while(|(_, loss)| *loss < before)
         .map(|(fit, _)| fit)
-        .filter(|fit| !only_aligns(bench, now, fit, fit.model.members.len() - 1))
-        .take(TRIED);
+        .filter(|fit| !only_aligns(bench, now, fit, fit.model.members.len() - 1));
+    let mut tried: Vec<&str> = Vec::new();
     for better in candidates {
         let index = better.model.members.len() - 1;
         let id = better.model.members[index].id();
+        if !tried.contains(&id) {
+            tried.push(id);
+            if tried.len() > TRIED {
+                break;
+            }
+        }
         let gain = share(bench, now, &better);
         if gain <= 0.0 {
             continue;
@@ -490,6 +556,9 @@ fn small(
         return Some("changes nothing".into());
     }
     let there = 1.0 - to / f64::max(from, 1e-300);
+    if cut(&after.model, index) && chance(&before.residual, &after.residual) {
+        return Some("shown only by readings that noise takes over the other's threshold".into());
+    }
     let (gain, there) = if bench.is_white() || cut(&after.model, index) {
         size_beside(bench, &before.residual, &after.model, index)
     } else {
@@ -546,6 +615,19 @@ fn small(
 fn cut(model: &Model, index: usize) -> bool {
     let mut others = model.members.iter().enumerate();
     others.any(|(other, member)| other != index && member.effect.cuts())
+}
+
+/// Whether single readings make up a gain: their squared errors fall by less than so many times what they change by, each on its
+/// own. Noise that takes a reading over a threshold changes it by all of the step, for better or for worse.
+fn chance(before: &[f64], after: &[f64]) -> bool {
+    let (sum, squares) = before
+        .iter()
+        .zip(after)
+        .map(|(before, after)| before * before - after * after)
+        .fold((0.0, 0.0), |(sum, squares), less| {
+            (sum + less, squares + less * less)
+        });
+    sum < PAIRED * f64::sqrt(squares)
 }
 
 /// How large an effect is beside the error as it is read, in energy: overall, and where it acts. What matters in practice is that,
