@@ -28,6 +28,9 @@ const SCALE: &str = "19";
 /// Fitted, held out (and driven once more with the calibration): seconds left out, and taken.
 const PIECES: [(&str, &str); 2] = [("280", "90"), ("1000", "45")];
 
+/// A calibration that changes nothing; the board is started as for one that does.
+const FACTORY: &str = "[[register]]\nname = \"current gain\"\nsmall = 0\nlarge = 0\n";
+
 /// A concealed sensor error.
 struct Error {
     name: &'static str,
@@ -73,6 +76,9 @@ pub struct Calibrated {
     pub before_a: f64,
     /// The same drive with the calibration, A.
     pub after_a: f64,
+    /// The same drive of a board without any error, calibrated to what it has from the factory: what comparison and conversion
+    /// leave, A.
+    pub ideal_a: f64,
     /// Error of the charge at the drive's end, uncalibrated, C.
     pub charge_before_c: f64,
     /// With the calibration, C.
@@ -199,20 +205,28 @@ impl Board {
         let Some(error) = ERRORS.iter().find(|error| error.name == planned.case.drive) else {
             bail!("no such error: {}", planned.case.drive);
         };
+        let factory = folders.case.join("factory.toml");
+        fs::write(&factory, FACTORY)?;
         let out = folders.case.join("drive");
-        self.drive(root, error.sensor, PIECES[1], Some(&calibration), &out)?;
         let again = folders.case.join("again");
-        fs::create_dir_all(&again)?;
-        fs::rename(out.join("board.csv"), again.join("holdout.csv"))?;
-        fs::remove_dir_all(&out)?;
         let designed = folders.given.join("model.toml");
-        let errors = tool.held_out(&again, &designed, &designed, false, LIMIT)?;
-        let after = errors
-            .get("i_meas_a")
-            .context("the second drive's log has no current")?;
+        fs::create_dir_all(&again)?;
+        let drive = |sensor: &[&str], calibration: &Path| -> Result<f64> {
+            self.drive(root, sensor, PIECES[1], Some(calibration), &out)?;
+            fs::rename(out.join("board.csv"), again.join("holdout.csv"))?;
+            fs::remove_dir_all(&out)?;
+            let errors = tool.held_out(&again, &designed, &designed, false, LIMIT)?;
+            let current = errors
+                .get("i_meas_a")
+                .context("the second drive's log has no current")?;
+            Ok(current.before)
+        };
+        let ideal_a = drive(&[], &factory)?;
+        let after_a = drive(error.sensor, &calibration)?;
         Ok(Some(Calibrated {
             before_a,
-            after_a: after.before,
+            after_a,
+            ideal_a,
             charge_before_c: charge_error(&Table::read(&folders.kept.join("holdout.csv"))?)?,
             charge_after_c: charge_error(&Table::read(&again.join("holdout.csv"))?)?,
         }))

@@ -532,11 +532,16 @@ fn board_table(text: &mut String, summary: &Summary) {
         text.push_str("Not run.\n\n");
         return;
     }
-    text.push_str("| concealed in the sensors | said | | second drive, error of the current, rms | error of its charge |\n|---|---|---|---|---|\n");
+    text.push_str("| concealed in the sensors | said | | second drive, error of the current, rms | a board without error | error of its charge |\n|---|---|---|---|---|---|\n");
     for line in &summary.board {
         let (current, charge) = match &line.calibrated {
             Some(one) => (
-                format!("{} → {} A", number(one.before_a), number(one.after_a)),
+                format!(
+                    "{} → {} A | {} A",
+                    number(one.before_a),
+                    number(one.after_a),
+                    number(one.ideal_a)
+                ),
                 format!(
                     "{} → {} C",
                     number(one.charge_before_c),
@@ -544,9 +549,12 @@ fn board_table(text: &mut String, summary: &Summary) {
                 ),
             ),
             None => (
-                line.error
-                    .clone()
-                    .unwrap_or("no calibration was written".to_owned()),
+                format!(
+                    "{} | –",
+                    line.error
+                        .as_deref()
+                        .unwrap_or("no calibration was written")
+                ),
                 "–".to_owned(),
             ),
         };

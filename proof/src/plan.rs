@@ -743,9 +743,9 @@ fn is_quick(planned: &Planned) -> bool {
     }
 }
 
-/// Added to the seeds below: with those themselves the tool was made, with 10 and 20 more it was judged and mended; what it is judged
+/// Added to the seeds below: with those themselves the tool was made, with 10 to 40 more it was judged and mended; what it is judged
 /// on now was not looked at before.
-pub const SEEDS: u64 = 40;
+pub const SEEDS: u64 = 50;
 
 /// The cases of a campaign. Other `seeds` make other data of the same kinds; real recordings and the board have none.
 pub fn plan(extent: Extent, real: &[Expected], seeds: u64) -> Vec<Planned> {
