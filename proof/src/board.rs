@@ -222,6 +222,7 @@ impl Board {
             Ok(current.before)
         };
         let ideal_a = drive(&[], &factory)?;
+        // Last: its log is what the charge is read from.
         let after_a = drive(error.sensor, &calibration)?;
         Ok(Some(Calibrated {
             before_a,

@@ -534,14 +534,10 @@ fn board_table(text: &mut String, summary: &Summary) {
     }
     text.push_str("| concealed in the sensors | said | | second drive, error of the current, rms | a board without error | error of its charge |\n|---|---|---|---|---|---|\n");
     for line in &summary.board {
-        let (current, charge) = match &line.calibrated {
+        let (current, ideal, charge) = match &line.calibrated {
             Some(one) => (
-                format!(
-                    "{} → {} A | {} A",
-                    number(one.before_a),
-                    number(one.after_a),
-                    number(one.ideal_a)
-                ),
+                format!("{} → {} A", number(one.before_a), number(one.after_a)),
+                format!("{} A", number(one.ideal_a)),
                 format!(
                     "{} → {} C",
                     number(one.charge_before_c),
@@ -549,18 +545,16 @@ fn board_table(text: &mut String, summary: &Summary) {
                 ),
             ),
             None => (
-                format!(
-                    "{} | –",
-                    line.error
-                        .as_deref()
-                        .unwrap_or("no calibration was written")
-                ),
+                line.error
+                    .clone()
+                    .unwrap_or("no calibration was written".to_owned()),
+                "–".to_owned(),
                 "–".to_owned(),
             ),
         };
         let _ = writeln!(
             text,
-            "| {} | {} | {} | {current} | {charge} |",
+            "| {} | {} | {} | {current} | {ideal} | {charge} |",
             line.concealed,
             names(&line.named),
             line.outcome.map_or("", outcome)

@@ -743,8 +743,8 @@ fn is_quick(planned: &Planned) -> bool {
     }
 }
 
-/// Added to the seeds below: with those themselves the tool was made, with 10 to 40 more it was judged and mended; what it is judged
-/// on now was not looked at before.
+/// Added to the seeds below: with those themselves the tool was made, with 10 to 40 more it was judged and mended. What has been
+/// changed since these were first looked at is told in docs/proof/method.md.
 pub const SEEDS: u64 = 50;
 
 /// The cases of a campaign. Other `seeds` make other data of the same kinds; real recordings and the board have none.

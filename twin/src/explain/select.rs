@@ -19,7 +19,7 @@ const FIRSTS: usize = 5;
 const PAIRS: usize = 6;
 /// Starts of each that are fitted.
 const STARTS: usize = 2;
-/// Starts that are fitted besides, because they take most of the error with its outliers.
+/// Candidates that are fitted besides, because they take most of the error with its outliers.
 const RARE: usize = 2;
 /// A pair is fitted if its start takes this share of what a pair has to take. Of 203 that took enough in the end, all but three
 /// began so (counted once, on 149 cases of the campaign's `--seeds 0`).
@@ -617,8 +617,8 @@ fn cut(model: &Model, index: usize) -> bool {
     others.any(|(other, member)| other != index && member.effect.cuts())
 }
 
-/// Whether single readings make up a gain: their squared errors fall by less than so many times what they change by, each on its
-/// own. Noise that takes a reading over a threshold changes it by all of the step, for better or for worse.
+/// Whether single readings make up a gain: the sum of what their squared errors fall by is less than so many times the root of the sum
+/// of its squares, which is what it would vary by if each fell or rose by chance. Noise that takes a reading over a threshold changes it by all of the step, for better or for worse.
 fn chance(before: &[f64], after: &[f64]) -> bool {
     let (sum, squares) = before
         .iter()
