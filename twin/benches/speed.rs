@@ -97,6 +97,7 @@ fn problem(rows: usize, view: View, effects: &[(&str, &[f64])]) -> Problem {
                 capacity_ah: 60.0,
                 efficiency: 1.0,
                 initial_soc: vec![0.8],
+                gap_excess_ah: Vec::new(),
                 initial_soc_sigma: 0.01,
                 ocv: (0..=100)
                     .map(|k| f64::from(k) / 100.0)

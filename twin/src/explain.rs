@@ -343,12 +343,14 @@ fn decide(
         unavoidable,
     );
     let held = folds(bench, &selection.fit);
+    let not_there = not_there(bench, &selection, others);
     let (verdict, beside) = doubt(
         bench,
         &mut selection,
         verdict,
         (left, &held),
         (confirmed, taken_back),
+        not_there,
         unavoidable,
     );
     Decided {
@@ -381,6 +383,67 @@ impl Unfitted<'_> {
     fn rmse_before(&self) -> f64 {
         rms(self.bench.residual(&self.bench.plain).into_iter())
     }
+
+    /// How many times the change that a model makes here is in this file's mismatch, and the standard error of that: regression of
+    /// the one on the other, blocks as clusters (Liang and Zeger 1986). 1 is what a true effect has; `None` without a change.
+    fn times_there(&self, model: &Model) -> Option<(f64, f64)> {
+        let mismatch = self.bench.residual(&self.bench.plain);
+        let left = self.bench.residual(&self.bench.run(&elsewhere(model)));
+        let change: Vec<f64> = mismatch.iter().zip(&left).map(|(a, b)| a - b).collect();
+        let blocks: Vec<_> = self.bench.blocks.clone();
+        let energy: f64 = blocks
+            .iter()
+            .map(|rows| fit::dot(&change[rows.clone()], &change[rows.clone()]))
+            .sum();
+        if blocks.len() < 2 || energy <= 0.0 {
+            return None;
+        }
+        let along: f64 = blocks
+            .iter()
+            .map(|rows| fit::dot(&change[rows.clone()], &mismatch[rows.clone()]))
+            .sum();
+        let times = along / energy;
+        let scatter: f64 = blocks
+            .iter()
+            .map(|rows| {
+                let of_block = rows
+                    .clone()
+                    .map(|row| change[row] * (mismatch[row] - times * change[row]));
+                of_block.sum::<f64>().powi(2)
+            })
+            .sum();
+        let count = blocks.len() as f64;
+        Some((times, (scatter * count / (count - 1.0)).sqrt() / energy))
+    }
+}
+
+/// What files that were never fitted say against the effects: the share, in energy, of their change that is too much or too
+/// little there, and in which file, where that is more than an equation's being idealised and chance make it.
+fn not_there(
+    bench: &Workbench<'_>,
+    selection: &Selection,
+    others: &[Unfitted<'_>],
+) -> Option<(f64, String)> {
+    let members = &selection.fit.model.members;
+    let rough = members
+        .iter()
+        .map(|member| roughness(bench, member))
+        .fold(0.0, f64::max);
+    others
+        .iter()
+        .filter_map(|other| {
+            let (times, error) = other.times_there(&selection.fit.model)?;
+            let off = (1.0 - times).abs();
+            (off - select::CERTAIN * error > WAVERS * rough).then(|| {
+                let text = format!(
+                    "{}, which was never fitted, has {} times the change that is expected there",
+                    other.file.display(),
+                    short(times)
+                );
+                (off.powi(2), text)
+            })
+        })
+        .max_by(|a, b| a.0.total_cmp(&b.0))
 }
 
 /// Whether every file that was never fitted is predicted much better with the effects than without.
@@ -424,13 +487,18 @@ fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>
 
 /// Whether values would have to differ from stretch to stretch by more than noise makes them, and by much.
 fn waver(bench: &Workbench<'_>, member: &Member, variation: &Variation) -> bool {
+    variation.deviations > select::CERTAIN
+        && variation.share > (WAVERS * roughness(bench, member)).powi(2)
+}
+
+/// What an effect's equation may be off by, as a share of its change, rms.
+fn roughness(bench: &Workbench<'_>, member: &Member) -> f64 {
     // Without relaxation and charge transfer the battery as designed is rougher than a sensor.
     let base = match bench.problem.base {
         Base::Sensor(_) => IDEALISED,
         Base::Battery(_) => 2.0 * IDEALISED,
     };
-    let rough = member.effect.idealised().max(base);
-    variation.deviations > select::CERTAIN && variation.share > (WAVERS * rough).powi(2)
+    member.effect.idealised().max(base)
 }
 
 /// Takes effects out again whose values would have to differ from stretch to stretch by more than noise makes them; true if there
@@ -863,6 +931,7 @@ fn doubt(
     verdict: Verdict,
     (left, held): (Explainable, &Held),
     (confirmed, taken_back): (bool, bool),
+    not_there: Option<(f64, String)>,
     unavoidable: f64,
 ) -> (Verdict, Option<f64>) {
     if taken_back && verdict == Verdict::NoMismatch {
@@ -917,6 +986,8 @@ fn doubt(
             doubts.push(format!("{what} {} of its change", percent(share.sqrt())));
         }
     }
+    let elsewhere = not_there.as_ref().map_or(0.0, |(share, _)| *share);
+    doubts.extend(not_there.map(|(_, text)| text));
     if doubts.is_empty() {
         return (verdict, None);
     }
@@ -925,7 +996,10 @@ fn doubt(
         selection.fit.model.ids().join(", "),
         doubts.join(", and ")
     ));
-    let most = signs.iter().map(|(share, ..)| *share).fold(0.0, f64::max);
+    let most = signs
+        .iter()
+        .map(|(share, ..)| *share)
+        .fold(elsewhere, f64::max);
     (Verdict::Ambiguous, Some(most * explained))
 }
 

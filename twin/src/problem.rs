@@ -85,10 +85,10 @@ pub struct Drive {
     pub cell_temperature_c: Option<Series>,
     /// Temperature of the surroundings in °C.
     pub ambient_c: Option<Series>,
-    /// Stretches with one clock and no gap; states (filters, charge) start anew in each, except where
-    /// [`Drive::continues`] says that the clock goes on.
+    /// Stretches with one clock and no gap; filters start anew in each.
     pub segments: Vec<Range<usize>>,
-    /// True where the segment of the same index continues the charge of the one before (a gap, not a new operation).
+    /// True where the segment of the same index continues the one before: a gap, and no new operation. What a cell or a core
+    /// remembers goes on over it ([`Drive::operations`]).
     pub continues: Vec<bool>,
 }
 
@@ -214,6 +214,9 @@ pub struct BatteryBase {
     pub efficiency: f64,
     /// State of charge at the start of each segment, 0 … 1.
     pub initial_soc: Vec<f64>,
+    /// What a counter says to have flowed over the gap before each segment beyond a straight line through the current at the gap's
+    /// ends, in Ah; 0, or no value, without one.
+    pub gap_excess_ah: Vec<f64>,
     /// Standard uncertainty of [`BatteryBase::initial_soc`], 0 … 1; 0: exact.
     pub initial_soc_sigma: f64,
     /// Open-circuit voltage of the whole series string: state of charge (ascending) and V.
@@ -295,6 +298,25 @@ impl Drive {
     /// True without rows.
     pub fn is_empty(&self) -> bool {
         self.t_s.is_empty()
+    }
+
+    /// Operations: segments with those that continue them.
+    pub fn operations(&self) -> Vec<Range<usize>> {
+        let mut operations: Vec<Range<usize>> = Vec::new();
+        for (index, rows) in self.segments.iter().enumerate() {
+            match operations.last_mut() {
+                Some(last) if self.is_continued(index) && last.end == rows.start => {
+                    last.end = rows.end;
+                }
+                _ => operations.push(rows.clone()),
+            }
+        }
+        operations
+    }
+
+    /// Whether a segment continues the one before.
+    pub fn is_continued(&self, segment: usize) -> bool {
+        segment > 0 && self.continues.get(segment).copied().unwrap_or_default()
     }
 
     /// Median step in s over all segments; 0 with fewer than two rows.

@@ -12,6 +12,7 @@ use std::path::Path;
 
 use common::{noise, said};
 
+use twin::explain::{Holdout, Options, explain};
 use twin::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
 use twin::report::data::{Report, Verdict};
 
@@ -84,8 +85,13 @@ fn explained_as_read(
     seed: u64,
     without: &[&str],
 ) -> Report {
+    said(problem_of(truth, value, coloured), seed, without)
+}
+
+/// Readings of the drive, under the model as designed.
+fn problem_of(truth: &Truth, value: Vec<f64>, coloured: Coloured) -> Problem {
     let rows = value.len();
-    let problem = Problem {
+    Problem {
         view: View::Sensor,
         name: "i_meas_a".into(),
         unit: "A".into(),
@@ -108,8 +114,7 @@ fn explained_as_read(
         noise: NOISE_A,
         coloured,
         accuracy: Accuracy::default(),
-    };
-    said(problem, seed, without)
+    }
 }
 
 #[track_caller]
@@ -520,4 +525,36 @@ fn the_same_seed_gives_the_same_report() {
     };
     let one = json(&explained(&truth, reading.clone(), 11, &[]));
     assert_eq!(one, json(&explained(&truth, reading, 11, &[])));
+}
+
+/// A file that was never fitted has to have what was found, once: half of it is no confirmation.
+#[test]
+fn what_another_file_has_half_of_is_doubted() {
+    let truth = truth();
+    let file = |gain: f64, seed| {
+        let mut noise = noise(seed, NOISE_A);
+        let value = truth.current_a.iter().map(|i| gain * i + noise()).collect();
+        problem_of(&truth, value, Coloured::default())
+    };
+    let verdict_with = |gain_there: f64| {
+        let holdout = Holdout {
+            file: "other.csv".into(),
+            problems: vec![file(gain_there, 42)],
+        };
+        let report = explain(
+            &[file(1.02, 41)],
+            &[holdout],
+            &Options::default(),
+            &mut |_, _| {},
+        );
+        assert_eq!(report.effects.len(), 1, "{:?}", report.effects);
+        assert_eq!(report.effects[0].id, "gain");
+        let told = report
+            .decisions
+            .iter()
+            .any(|text| text.contains("other.csv, which was never fitted, has 0.5"));
+        (report.verdict, told)
+    };
+    assert_eq!(verdict_with(1.02), (Verdict::Explained, false));
+    assert_eq!(verdict_with(1.0104), (Verdict::Ambiguous, true));
 }

@@ -57,7 +57,11 @@ impl Effect for CellSelfHeating {
         let (rth_k_per_w, tau_s) = (values[0], values[1]);
         let ohms = battery.base.resistance_ohm;
         let b_k = *battery.arrhenius_k.get_or_insert(USUAL_B_K);
-        for rows in drive.segments.iter().filter(|rows| !rows.is_empty()) {
+        for rows in drive
+            .operations()
+            .into_iter()
+            .filter(|rows| !rows.is_empty())
+        {
             let mut warmer_k = 0.0;
             let (mut step_s, mut kept) = (0.0, 1.0);
             let times = drive.t_s[rows.clone()].windows(2);

@@ -104,8 +104,8 @@ impl Effect for CoreHysteresis {
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         if let &[remanence_a, coercivity_a, spread] = values {
             let relays = Relays::new(remanence_a, coercivity_a, spread);
-            for rows in &scene.drive.segments {
-                relays.add(&mut scene.signal[rows.clone()]);
+            for rows in scene.drive.operations() {
+                relays.add(&mut scene.signal[rows]);
             }
             return;
         }
@@ -122,9 +122,9 @@ impl Effect for CoreHysteresis {
             },
             full_scale,
         );
-        for rows in &scene.drive.segments {
+        for rows in scene.drive.operations() {
             let mut state = MagneticCoreState::default();
-            for value in &mut scene.signal[rows.clone()] {
+            for value in &mut scene.signal[rows] {
                 state = core.magnetise(&state, *value);
                 *value += core.zero_error_a(&state);
             }

@@ -89,7 +89,7 @@ impl Effect for Diffusion {
             .collect();
         let (weights, taus) = series();
         let mut drop = steps.ladder(
-            &drive.segments,
+            &drive.operations(),
             &driven,
             taus.map(|share| share * tau),
             weights.map(|share| share * ohms),

@@ -73,9 +73,9 @@ impl Effect for OcvHysteresis {
         };
         let (signal, added_v) = (&scene.signal[..], &mut battery.added_v[..]);
         let per_as = gamma / (3600.0 * battery.capacity_ah);
-        for rows in drive.segments.iter().filter(|rows| !rows.is_empty()) {
+        for rows in drive.operations() {
             let mut h = 0.0;
-            for row in rows.clone().skip(1) {
+            for row in rows.skip(1) {
                 let i = 0.5 * (signal[row] + signal[row - 1]);
                 if i != 0.0 {
                     let target = -i.signum();

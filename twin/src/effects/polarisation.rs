@@ -97,7 +97,7 @@ impl Effect for Polarisation {
             .zip(&battery.factor)
             .map(|(i, factor)| i * factor)
             .collect();
-        let segments = &drive.segments;
+        let segments = &drive.operations();
         let v = match *values {
             [r1, tau1] => steps.ladder(segments, &driven, [tau1], [r1]),
             [r1, tau1, r2, tau2] => steps.ladder(segments, &driven, [tau1, tau2], [r1, r2]),

@@ -217,13 +217,14 @@ pub struct Steps {
 }
 
 impl Steps {
-    /// Of a drive's rows.
-    pub fn new(t_s: &[f64], segments: &[Range<usize>]) -> Self {
+    /// Of a drive's rows; the step to the first row of a segment that continues another is the gap between them.
+    pub fn new(drive: &Drive) -> Self {
+        let (t_s, segments) = (&drive.t_s, &drive.segments);
         let mut kind = vec![0; t_s.len()];
         let mut length_s = vec![0.0];
         let mut numbers: HashMap<u64, u32> = HashMap::new();
         let mut known = [(u64::MAX, 0u32); KNOWN];
-        for rows in segments.iter().filter(|rows| !rows.is_empty()) {
+        for rows in drive.operations() {
             for row in rows.start + 1..rows.end {
                 let h = t_s[row] - t_s[row - 1];
                 if h.is_nan() || h <= 0.0 {
@@ -292,6 +293,8 @@ impl Steps {
             return output;
         }
         let weights: Vec<[f64; 3]> = self.weights(tau_s, held).collect();
+        // Parts of segments, or segments with the gaps between them, are not known to be even.
+        let even = segments.len() == self.even_s.len();
         for (index, rows) in segments.iter().enumerate() {
             let Some(mut last) = input[rows.clone()].first().copied() else {
                 continue;
@@ -301,7 +304,7 @@ impl Steps {
             let output = &mut output[after.clone()];
             let kinds = &self.kind[after];
             // Each row waits for the one before it: of even steps four are made from one.
-            let fours = if self.even_s[index].is_some() {
+            let fours = if even && self.even_s[index].is_some() {
                 output.len() / 4
             } else {
                 0
@@ -573,7 +576,7 @@ impl<'a> Scene<'a> {
         Self {
             drive,
             observed: &problem.observed,
-            steps: Arc::new(Steps::new(&drive.t_s, &drive.segments)),
+            steps: Arc::new(Steps::new(drive)),
             changes: Arc::new(range_changes(drive, sensor)),
             signal: drive.reference.clone(),
             delay_s: 0.0,
@@ -586,6 +589,12 @@ impl<'a> Scene<'a> {
     /// Whether the reference stays at its value until its next row.
     pub fn held(&self) -> bool {
         self.sensor.is_some_and(|sensor| sensor.held_reference)
+    }
+
+    /// First-order low-pass that goes on over gaps: of what has a memory whether it is looked at or not.
+    pub fn low_pass_over_gaps(&self, input: &[f64], tau_s: f64) -> Vec<f64> {
+        let operations = self.drive.operations();
+        self.steps.low_pass(&operations, input, tau_s, self.held())
     }
 
     /// First-order low-pass of the scene's own signal.
@@ -695,13 +704,22 @@ impl<'a> Battery<'a> {
     pub fn count(&mut self, drive: &Drive, current_a: &[f64]) {
         let mut soc = vec![0.0; drive.len()];
         let per_as = 1.0 / (3600.0 * self.capacity_ah);
+        let of_segment = |values: &[f64], index: usize| values.get(index).copied();
+        let mut end = 1.0;
         for (index, rows) in drive
             .segments
             .iter()
             .enumerate()
             .filter(|(_, rows)| !rows.is_empty())
         {
-            let first = self.base.initial_soc.get(index).copied().unwrap_or(1.0) + self.soc_shift;
+            let first = if drive.is_continued(index) {
+                let excess_ah = of_segment(&self.base.gap_excess_ah, index).unwrap_or_default();
+                let gap_s = drive.t_s[rows.start] - drive.t_s[rows.start - 1];
+                let ends = [current_a[rows.start - 1], current_a[rows.start]];
+                end - gap_ah(ends, gap_s, excess_ah, self.efficiency) / self.capacity_ah
+            } else {
+                of_segment(&self.base.initial_soc, index).unwrap_or(1.0) + self.soc_shift
+            };
             soc[rows.start] = first;
             let mut last = first;
             let after = rows.start + 1..rows.end;
@@ -712,6 +730,7 @@ impl<'a> Battery<'a> {
                 last -= mean * (times[1] - times[0]) * per_as;
                 *soc = last;
             }
+            end = last;
         }
         self.soc = soc.into();
     }
@@ -753,6 +772,21 @@ pub fn mean_flow(from: f64, to: f64, efficiency: f64) -> f64 {
         (false, false) => 0.0,
     };
     0.5 * (from + to) - (1.0 - efficiency) * charging
+}
+
+/// Ah that leave a battery over a gap in its current: by a straight line through the current at its ends, or with what a counter says
+/// to have flowed beyond that. Where only the sum is known, it charges if it is below 0.
+pub fn gap_ah(ends_a: [f64; 2], gap_s: f64, excess_ah: f64, efficiency: f64) -> f64 {
+    let [from, to] = ends_a;
+    if excess_ah == 0.0 {
+        return mean_flow(from, to, efficiency) * gap_s / 3600.0;
+    }
+    let flowed_ah = 0.5 * (from + to) * gap_s / 3600.0 + excess_ah;
+    if flowed_ah < 0.0 {
+        efficiency * flowed_ah
+    } else {
+        flowed_ah
+    }
 }
 
 /// Factor of a resistance of Arrhenius temperature `b_k`, in K, from 25 °C to a temperature.
@@ -798,10 +832,21 @@ pub fn open_circuit_v(table: &[(f64, f64)], soc: &[f64]) -> Vec<f64> {
 mod tests {
     use super::*;
 
+    /// One segment.
+    fn drive(t_s: &[f64]) -> Drive {
+        Drive {
+            t_s: t_s.to_vec().into(),
+            reference: vec![0.0; t_s.len()].into(),
+            segments: vec![0..t_s.len()],
+            continues: vec![false],
+            ..Drive::default()
+        }
+    }
+
     #[test]
     fn a_low_pass_follows_a_ramp_late_by_tau() {
         let t_s: Vec<f64> = (0..2000).map(|k| f64::from(k) * 0.01).collect();
-        let output = Steps::new(&t_s, &[0..2000]).low_pass(&[0..2000], &t_s, 0.5, false);
+        let output = Steps::new(&drive(&t_s)).low_pass(&[0..2000], &t_s, 0.5, false);
         assert!((output[1999] - (t_s[1999] - 0.5)).abs() < 1e-9);
     }
 
@@ -897,7 +942,7 @@ mod tests {
         let t_s: Vec<f64> = (0..100).map(|k| f64::from(k) * 0.1).collect();
         let mut step = vec![1.0; 100];
         step[0] = 0.0;
-        let held = Steps::new(&t_s, &[0..100]).low_pass(&[0..100], &step, 2.0, true);
+        let held = Steps::new(&drive(&t_s)).low_pass(&[0..100], &step, 2.0, true);
         // The held 0 lasts until the second row.
         assert!((held[41] - (1.0 - (-4.0f64 / 2.0).exp())).abs() < 1e-9);
     }

@@ -63,7 +63,7 @@ impl Effect for SensorSelfHeating {
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let squares: Vec<f64> = scene.signal.iter().map(|value| value * value).collect();
-        let heat = scene.low_pass(&squares, values[1]);
+        let heat = scene.low_pass_over_gaps(&squares, values[1]);
         drop(squares);
         for (value, heat) in scene.signal.iter_mut().zip(heat) {
             *value *= 1.0 + values[0] * heat;

@@ -268,7 +268,7 @@ fn columns(bench: &Workbench<'_>, rows: &[usize]) -> Vec<Vec<f64>> {
         push(here.iter().map(|v| (v - knot).max(0.0)).collect());
     }
     // What came before, on two ladders of times.
-    let steps = Steps::new(&drive.t_s, &drive.segments);
+    let steps = Steps::new(drive);
     let mut tau = 0.5 * scale.step_s;
     while tau < 0.3 * scale.span_s && tau < 4000.0 * scale.step_s {
         let slow = steps.low_pass(&drive.segments, x, tau, false);

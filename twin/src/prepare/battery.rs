@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::{Item, Purpose, Work, checks, held::Freshness, series};
 use crate::{
-    effects::scene::mean_flow,
+    effects::scene::{gap_ah, mean_flow},
     failure::Failure,
     model::Battery,
     problem::{Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, View},
@@ -89,6 +89,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             capacity_ah: battery.capacity_ah,
             efficiency: battery.efficiency,
             initial_soc: Vec::new(),
+            gap_excess_ah: Vec::new(),
             initial_soc_sigma: battery.initial_soc_uncertainty,
             ocv,
             cells,
@@ -187,19 +188,19 @@ fn start(
     let mut end = 1.0;
     let mut bridged = 0;
     for (index, own) in drive.segments.iter().enumerate() {
-        let first = if drive.continues[index] && index > 0 {
+        let mut excess_ah = 0.0;
+        let first = if drive.is_continued(index) {
             let gap_s = drive.t_s[own.start] - drive.t_s[own.start - 1];
+            let ends_a = [drive.reference[own.start - 1], drive.reference[own.start]];
             let before = &drive.segments[index - 1];
             let counted = counter
                 .as_ref()
                 .and_then(|ah| over_gap(ah, drive, before.clone(), own.start, battery.capacity_ah));
-            let ah = counted.unwrap_or_else(|| {
-                bridged += 1;
-                let mean = 0.5 * (drive.reference[own.start] + drive.reference[own.start - 1]);
-                mean * gap_s / 3600.0
-            });
-            let efficiency = if ah < 0.0 { battery.efficiency } else { 1.0 };
-            end - ah * efficiency / battery.capacity_ah
+            match counted {
+                Some(ah) => excess_ah = ah - gap_ah(ends_a, gap_s, 0.0, 1.0),
+                None => bridged += 1,
+            }
+            end - gap_ah(ends_a, gap_s, excess_ah, battery.efficiency) / battery.capacity_ah
         } else if let Some(stated) = battery.initial_soc.filter(|_| clocks[index] == 0) {
             stated
         } else if let Some((soc, uncertainty)) = seen(base, drive, own.start, observed, index, view)
@@ -220,6 +221,7 @@ fn start(
             1.0
         };
         base.initial_soc.push(first);
+        base.gap_excess_ah.push(excess_ah);
         end = first - charge_ah(drive, own.clone(), battery.efficiency) / battery.capacity_ah;
     }
     base.initial_soc_sigma = sigma;

@@ -1,0 +1,148 @@
+//! A gap in the recording is no new operation: what a cell or a core remembers goes on over it.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+use std::ops::Range;
+
+use twin::explain::predict;
+use twin::problem::{
+    Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, View,
+};
+
+const ROWS: usize = 1200;
+const STEP_S: f64 = 0.5;
+/// Rows that are not recorded: the current stays as it was in each, so that a straight line over the gap is what flowed.
+const GAPS: [Range<usize>; 3] = [210..390, 610..690, 1010..1090];
+
+/// 200 rows each of a current in A: discharge, rest and charge.
+fn current_a(row: usize) -> f64 {
+    [6.0, 2.0, -4.0, 0.0, 9.0, -3.0][row / 200] + if row % 200 < 5 { 1.0 } else { 0.0 }
+}
+
+/// The recording with or without its gaps, of a view.
+fn problem(view: View, base: Base, with_gaps: bool) -> (Problem, Vec<usize>) {
+    let rows: Vec<usize> = (0..ROWS)
+        .filter(|row| !with_gaps || !GAPS.iter().any(|gap| gap.contains(row)))
+        .collect();
+    let t_s: Vec<f64> = rows.iter().map(|row| *row as f64 * STEP_S).collect();
+    let starts: Vec<usize> = (0..rows.len())
+        .filter(|at| *at == 0 || rows[*at] != rows[*at - 1] + 1)
+        .collect();
+    let ends = starts[1..].iter().copied().chain([rows.len()]);
+    let drive = Drive {
+        t_s: t_s.clone().into(),
+        reference: rows
+            .iter()
+            .map(|row| current_a(*row))
+            .collect::<Vec<_>>()
+            .into(),
+        segments: starts
+            .iter()
+            .copied()
+            .zip(ends)
+            .map(|(a, b)| a..b)
+            .collect(),
+        continues: (0..starts.len()).map(|index| index > 0).collect(),
+        ..Drive::default()
+    };
+    let mut observed = Observed::with_drive(t_s, vec![0.0; rows.len()]);
+    observed.stretches = (0..rows.len())
+        .map(|row| {
+            drive
+                .segments
+                .iter()
+                .position(|rows| rows.contains(&row))
+                .unwrap()
+        })
+        .collect();
+    let problem = Problem {
+        view,
+        name: "x".into(),
+        unit: "1".into(),
+        drive,
+        observed,
+        base,
+        modelled: Vec::new(),
+        noise: 0.0,
+        coloured: Coloured::default(),
+        accuracy: Accuracy::default(),
+    };
+    (problem, rows)
+}
+
+/// Whether the rows that both have are the same with an effect, and the effect is there.
+#[track_caller]
+fn assert_goes_on(view: View, base: &Base, id: &str, values: &[f64]) {
+    let said = |with_gaps: bool| {
+        let (problem, rows) = problem(view, base.clone(), with_gaps);
+        let plain = predict(&problem, &[]);
+        let effects = [(id.to_owned(), values.to_vec())];
+        (rows, predict(&problem, &effects), plain)
+    };
+    let ((_, whole, plain), (rows, cut, _)) = (said(false), said(true));
+    let largest = whole
+        .iter()
+        .zip(&plain)
+        .fold(0.0f64, |most, (with, without)| {
+            most.max((with - without).abs())
+        });
+    assert!(largest > 1e-4, "{id}: {largest}");
+    // The resistance at which a gap's loss is made is that where it begins.
+    let tolerance = if id == "cell-self-heating" {
+        1e-5
+    } else {
+        1e-9
+    };
+    for (row, value) in rows.into_iter().zip(cut) {
+        assert!(
+            (value - whole[row]).abs() < tolerance,
+            "{id}, row {row}: {value} and {}",
+            whole[row]
+        );
+    }
+}
+
+#[test]
+fn a_cell_goes_on_over_a_gap() {
+    let cell = Base::Battery(BatteryBase {
+        capacity_ah: 3.0,
+        efficiency: 0.99,
+        // As designed, where the gaps begin and end is known to be so only without an effect.
+        initial_soc: vec![0.9; 4],
+        ocv: vec![(0.0, 3.0), (0.5, 3.6), (1.0, 4.2)],
+        cells: 1.0,
+        resistance_ohm: 0.02,
+        ..BatteryBase::default()
+    });
+    for (id, values) in [
+        ("capacity", vec![2.6]),
+        ("coulombic-efficiency", vec![0.9]),
+        ("parasitic-load", vec![0.3]),
+        ("ocv-hysteresis", vec![0.02, 60.0]),
+        ("polarisation", vec![0.01, 40.0]),
+        ("polarisation", vec![0.01, 4.0, 0.02, 90.0]),
+        ("diffusion", vec![0.03, 300.0]),
+        ("cell-self-heating", vec![8.0, 120.0]),
+    ] {
+        assert_goes_on(View::Voltage, &cell, id, &values);
+    }
+    for (id, values) in [("capacity", vec![2.6]), ("coulombic-efficiency", vec![0.9])] {
+        assert_goes_on(View::StateOfCharge, &cell, id, &values);
+    }
+}
+
+#[test]
+fn a_core_and_its_heat_go_on_over_a_gap() {
+    let sensor = Base::Sensor(SensorBase {
+        full_scale: Some(10.0),
+        range_ratio: 10.0,
+        ..SensorBase::default()
+    });
+    for (id, values) in [
+        ("core-hysteresis", vec![0.1, 1.0]),
+        ("core-hysteresis", vec![0.1, 1.0, 1.0]),
+        ("sensor-self-heating", vec![1e-3, 30.0]),
+    ] {
+        assert_goes_on(View::Sensor, &sensor, id, &values);
+    }
+}
