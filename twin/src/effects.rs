@@ -182,8 +182,10 @@ pub enum Stage {
     Output,
     /// Charge that the battery takes and gives.
     BatteryCharge,
-    /// Temperature of the cell.
+    /// What temperature does to the cell.
     BatteryTemperature,
+    /// What the cell does to its temperature: its resistance, and how that follows temperature, is known by then.
+    BatteryHeat,
     /// Ohmic resistance.
     BatteryResistance,
     /// Voltages beside the ohmic drop.
@@ -218,6 +220,15 @@ pub const IDEALISED: f64 = 0.05;
 const STRAIGHT: f64 = 0.08;
 /// The same of a bend, of which only the place and the end are physics.
 const BENT: f64 = 0.3;
+
+/// A period is told from how long readings stay, which is in whole rows: to so much of itself.
+const WHOLE_ROWS: f64 = 1.1;
+
+/// Of a time within the period for which readings stay: a mean over so long, or so late a reading, is what a part of each period,
+/// measured and held, gives.
+fn within_a_period(time_s: f64, held_s: f64) -> Option<&'static str> {
+    (time_s <= WHOLE_ROWS * held_s).then_some(sampled_window::SampledWindow.card().id)
+}
 
 /// An effect of the library.
 pub trait Effect: Sync {
@@ -281,6 +292,11 @@ pub trait Effect: Sync {
         false
     }
 
+    /// Of an effect that cuts or rounds: whether the readings show that noise went in with the signal, and was not added behind it.
+    fn noise_ahead(&self, _values: &[f64], _clues: &Clues<'_>) -> bool {
+        true
+    }
+
     /// Whether a parameter is a level at which readings stay.
     fn level(&self, _parameter: usize) -> bool {
         false
@@ -296,6 +312,15 @@ pub trait Effect: Sync {
     /// current: parts that an instrument is made of are straight to some percent of what they are off by.
     fn curve(&self) -> f64 {
         STRAIGHT
+    }
+
+    /// Puts values that mean the same in different orders (branches) into one.
+    fn ordered(&self, _values: &mut [f64]) {}
+
+    /// The effect that does the same where readings stay for `held_s`, though the design says that each is new: what a reading holds
+    /// is then part of a period.
+    fn when_held(&self, _values: &[f64], _held_s: f64) -> Option<&'static str> {
+        None
     }
 
     /// What follows from the values, in plain words.

@@ -323,13 +323,14 @@ fn decide(
     progress(0.95, "looking at what is left");
     let features = Features::new(bench);
     let before = features.explain(&selection.plain.residual, seed);
+    let passed = !selection.named.is_empty();
     veto(bench, &mut selection, others);
     vague(bench, &mut selection);
-    let taken_back = wavering(bench, &mut selection, others);
-    if taken_back {
+    if wavering(bench, &mut selection, others) {
         vague(bench, &mut selection);
     }
     shape::withdraw((bench, read), &mut selection, seed);
+    let taken_back = passed && selection.named.is_empty();
     let left = features.explain(&selection.fit.residual, seed);
     let confirmed = confirmed(&selection, others);
     let unavoidable = unavoidable(bench, &selection.fit, seed);
@@ -504,7 +505,7 @@ fn roughness(bench: &Workbench<'_>, member: &Member) -> f64 {
 /// Takes effects out again whose values would have to differ from stretch to stretch by more than noise makes them; true if there
 /// were any.
 fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>]) -> bool {
-    let mut any = false;
+    let mut refused: Vec<&'static str> = Vec::new();
     while !selection.named.is_empty() && !confirmed(selection, others) {
         let members = &selection.fit.model.members;
         let found = intervals::variations(bench, &selection.fit)
@@ -515,9 +516,11 @@ fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted
         let Some((index, variation)) = found else {
             break;
         };
+        let id = members[index].id();
+        // What was refused once does not come back in another's place: else two could take turns for ever.
+        refused.push(id);
         selection.refused.push(format!(
-            "{}: fits, but its values would have to differ by {} from stretch to stretch, {:.0} standard deviations more than noise: what is there is not constant",
-            selection.fit.model.members[index].id(),
+            "{id}: fits, but its values would have to differ by {} from stretch to stretch, {:.0} standard deviations more than noise: what is there is not constant",
             percent(variation.share.sqrt()),
             variation.deviations
         ));
@@ -526,15 +529,21 @@ fn wavering(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted
             let last = last.last().zip(fit.model.members.last());
             last.is_some_and(|(variation, member)| !waver(bench, member, variation))
         };
-        replace(bench, selection, index, "its values stay", &steady);
-        any = true;
+        replace(
+            bench,
+            selection,
+            index,
+            ("its values stay", &refused),
+            &steady,
+        );
     }
-    any
+    !refused.is_empty()
 }
 
 /// Takes effects out again whose values the recording does not tell; where others would do as well, the best of those whose
 /// values it does tell takes the place.
 fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
+    let mut refused: Vec<&'static str> = Vec::new();
     while !selection.named.is_empty() {
         let intervals = intervals::intervals(bench, &selection.fit, 0.0);
         let members = &selection.fit.model.members;
@@ -550,6 +559,7 @@ fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
             return;
         };
         let id = members[index].id();
+        refused.push(id);
         selection.refused.push(format!(
             "{id}: fits, but this recording does not tell its values: {why}"
         ));
@@ -557,7 +567,7 @@ fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
             bench,
             selection,
             index,
-            "the recording tells its values",
+            ("the recording tells its values", &refused),
             &|_| true,
         );
     }
@@ -568,12 +578,16 @@ fn replace(
     bench: &Workbench<'_>,
     selection: &mut Selection,
     index: usize,
-    why: &str,
+    (why, refused): (&str, &[&'static str]),
     holds: &dyn Fn(&Fit) -> bool,
 ) {
     let id = selection.fit.model.members[index].id();
+    let holds = |fit: &Fit| {
+        let last = fit.model.members.last();
+        last.is_none_or(|member| !refused.contains(&member.id())) && holds(fit)
+    };
     let without = fit::fit(bench, &selection.fit.model.without(index), None);
-    match stand_in(bench, selection, &without.model, index, holds) {
+    match stand_in(bench, selection, &without.model, index, &holds) {
         Some(better) => {
             selection.decisions.push(format!(
                 "{} instead of {id}: as good, and {why}.",
@@ -609,7 +623,12 @@ fn stand_in(
         })
         .map(|model| fit::fit(bench, &model, None))
         .collect();
-    fits.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+    // In one spread for all: in its own, a bad fit's residual is a small one.
+    let sigma = fits
+        .iter()
+        .fold(selection.fit.sigma, |least, fit| least.min(fit.sigma));
+    let loss = |fit: &Fit| fit::loss(&fit.residual, sigma);
+    fits.sort_by(|a, b| loss(a).total_cmp(&loss(b)));
     let found = fits.into_iter().find(|fit| {
         let last = fit.model.members.len() - 1;
         let member = &fit.model.members[last];
@@ -621,6 +640,7 @@ fn stand_in(
             )
             .is_none()
             && holds(fit)
+            && !select::beaten(bench, fit, &selection.fit)
     });
     found.map(|fit| fit::polish(bench, &fit))
 }
@@ -712,7 +732,12 @@ fn quantile(series: &[f64], share: f64) -> f64 {
 fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
     let count = bench.len() as f64;
     let noise = bench.problem.noise;
-    let cuts = fit.model.members.iter().any(|member| member.effect.cuts());
+    let as_read = bench.as_read(&fit.predicted);
+    let clues = bench.clues(&as_read);
+    let cuts =
+        fit.model.members.iter().any(|member| {
+            member.effect.cuts() && member.effect.noise_ahead(&member.values, &clues)
+        });
     if noise > 0.0 && cuts {
         let energy = bench.noise_energy(&fit.model, &fit.predicted, noise, seed);
         energy.max(noise * noise * count)
@@ -720,8 +745,6 @@ fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
         noise * noise * count
     } else {
         // A grid is told by the readings; reading and simulation are both on it.
-        let as_read = bench.as_read(&fit.predicted);
-        let clues = bench.clues(&as_read);
         let grid: f64 = fit
             .model
             .members
@@ -936,8 +959,7 @@ fn doubt(
 ) -> (Verdict, Option<f64>) {
     if taken_back && verdict == Verdict::NoMismatch {
         selection.decisions.push(
-            "There is a mismatch, yet the only effects that take it would have to change in the course of the recording: unknown."
-                .into(),
+            "There is a mismatch, yet the only effects that take it are not named: unknown.".into(),
         );
         return (Verdict::Unknown, None);
     }
@@ -1346,6 +1368,10 @@ fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
             .map(|member| (member.id().to_owned(), values(member)))
             .collect(),
         nuisance: fit.model.nuisance,
+        initial_soc: match &problem.base {
+            Base::Battery(base) => base.initial_soc.first().copied(),
+            Base::Sensor(_) => None,
+        },
     }
 }
 

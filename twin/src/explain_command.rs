@@ -297,7 +297,7 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
                     .collect(),
             });
         }
-        shift.take(fitted.nuisance);
+        shift.take(fitted.nuisance, fitted.initial_soc);
     }
     model.extended(&found, shift, file.parent().unwrap_or(Path::new("")), out)
 }

@@ -600,8 +600,13 @@ fn modelled(
     let mut ordered = Vec::new();
     for parameter in parameters.iter() {
         let value = values.get(parameter.name).copied().unwrap_or(parameter.off);
-        if value.is_nan() {
-            return Err(places.fault(&["effects", id, parameter.name], "nan", "a number"));
+        // Without end is what switches some effects off (a knee, a rail), and no value of another.
+        if !value.is_finite() && value != parameter.off {
+            return Err(places.fault(
+                &["effects", id, parameter.name],
+                &value.to_string(),
+                "a finite number",
+            ));
         }
         ordered.push(value);
     }

@@ -277,10 +277,13 @@ impl<'a> Work<'a> {
         let parts = series::drive(self.drive_frame(), found);
         let mut drive = parts.drive;
         self.surroundings(&mut drive, &parts.rows);
-        let (observed, rows) = match &value {
+        let (mut observed, rows) = match &value {
             Some(value) => self.observe(&drive, &parts.rows, &parts.clocks, value, &fresh),
             None => (series::every_row(&drive), Arc::clone(&parts.rows)),
         };
+        if board.is_none() && sensor.interval_s == 0.0 {
+            observed.held_s = fresh.interval_s.unwrap_or_default();
+        }
         if self.purpose == Purpose::Compare && value.is_some() {
             let wild = checks::wild(&drive, &observed);
             let names = [reference.as_str(), measured.as_str()];
@@ -613,22 +616,30 @@ fn model_effects(model: &Model, item: &mut Item) {
     if problem.modelled.is_empty() {
         return;
     }
-    let empty = |problem: &Problem| {
-        let mut plain = problem.clone();
-        plain.modelled.clear();
-        if let Base::Sensor(base) = &mut plain.base {
-            base.reading.clear();
-        }
-        plain
-    };
-    let plain = empty(problem);
+    let changed = modelled_change(problem);
     let Base::Sensor(base) = &mut problem.base else {
         return;
     };
     if base.reading.is_empty() {
         return;
     }
-    // A board's reading with the effects in it: what they change of an ideal sensor's reading.
+    // Between two conversions the board holds its reading, with what the effects made of it.
+    let mut held = 0.0;
+    for (row, reading) in base.reading.iter_mut().enumerate() {
+        if item.fresh.get(row).is_none_or(|fresh| *fresh) {
+            held = changed[row];
+        }
+        *reading += held;
+    }
+}
+
+/// What the effects of the model file change of an ideal sensor's reading, at each observed row.
+pub fn modelled_change(problem: &Problem) -> Vec<f64> {
+    let mut plain = problem.clone();
+    plain.modelled.clear();
+    if let Base::Sensor(base) = &mut plain.base {
+        base.reading.clear();
+    }
     let effects: Vec<(String, Vec<f64>)> = problem
         .modelled
         .iter()
@@ -638,14 +649,7 @@ fn model_effects(model: &Model, item: &mut Item) {
         explain::predict(&plain, &effects),
         explain::predict(&plain, &[]),
     );
-    // Between two conversions the board holds its reading, with what the effects made of it.
-    let mut held = 0.0;
-    for (row, reading) in base.reading.iter_mut().enumerate() {
-        if item.fresh.get(row).is_none_or(|fresh| *fresh) {
-            held = with[row] - without[row];
-        }
-        *reading += held;
-    }
+    with.iter().zip(without).map(|(w, o)| w - o).collect()
 }
 
 /// A time in a remark.

@@ -157,6 +157,8 @@ pub struct Observed {
     pub stretches: Stretches,
     /// True if row `k` of the observation is row `k` of the drive (same time stamps): no interpolation then.
     pub on_drive_rows: bool,
+    /// Time between two new readings, in s, where readings repeat though the design says that each is new; else 0.
+    pub held_s: f64,
 }
 
 impl Observed {
@@ -166,6 +168,7 @@ impl Observed {
             valid: vec![true; value.len()],
             stretches: Stretches::one(value.len()),
             on_drive_rows: true,
+            held_s: 0.0,
             t_s: t_s.into(),
             value,
         }

@@ -558,3 +558,82 @@ fn what_another_file_has_half_of_is_doubted() {
     assert_eq!(verdict_with(1.02), (Verdict::Explained, false));
     assert_eq!(verdict_with(1.0104), (Verdict::Ambiguous, true));
 }
+
+/// Rests, with pulses of a current that jumps within a row.
+fn pulses() -> Truth {
+    let mut truth = truth();
+    for (row, current) in truth.current_a.iter_mut().enumerate() {
+        *current = match row {
+            2000..2100 => 60.0,
+            6000..6040 => -40.0,
+            _ => 0.0,
+        };
+    }
+    truth
+}
+
+/// The signal at an earlier time: straight lines.
+fn earlier(signal: &[f64], late_s: f64) -> Vec<f64> {
+    (0..signal.len())
+        .map(|row| {
+            let at = (row as f64 - late_s / STEP_S).max(0.0);
+            let before = signal[at as usize];
+            let after = signal[(at as usize + 1).min(signal.len() - 1)];
+            before + (after - before) * at.fract()
+        })
+        .collect()
+}
+
+/// On four edges a delay, a lag and a window do the same: none is named alone.
+#[test]
+fn few_edges_name_no_one_alone() {
+    let truth = pulses();
+    for seed in [51, 52, 53] {
+        let report = explained(&truth, earlier(&truth.current_a, 0.1045), seed, &[]);
+        assert_named(&report, "delay", &[]);
+        assert!(
+            !report.effects[0].equivalent_to.is_empty(),
+            "{:?}",
+            report.effects
+        );
+    }
+}
+
+/// Readings that stay, though the design says that each is new, are measured and held: no mean alone.
+#[test]
+fn a_window_that_is_held_is_named_as_such() {
+    let truth = truth();
+    let period = 12;
+    let mut noise = noise(61, NOISE_A);
+    let (mut value, mut fresh) = (Vec::new(), Vec::new());
+    for row in 0..ROWS {
+        fresh.push(row % period == 0);
+        value.push(if row % period == 0 {
+            let from = row.saturating_sub(period);
+            let sum: f64 = (from..row)
+                .map(|k| 0.5 * (truth.current_a[k] + truth.current_a[k + 1]))
+                .sum();
+            sum / (row - from).max(1) as f64 + noise()
+        } else {
+            value[row - 1]
+        });
+    }
+    let mut problem = problem_of(&truth, value, Coloured::default());
+    problem.observed.valid = fresh;
+    problem.observed.held_s = period as f64 * STEP_S;
+    assert_named(&said(problem, 61, &[]), "sampled-window", &[]);
+}
+
+/// A zero that jumps is no staircase, however well one of its steps fits.
+#[test]
+fn a_jump_of_the_zero_is_no_staircase() {
+    let truth = truth();
+    for (seed, jump_a) in [(71, 3.0), (72, -6.0)] {
+        let value = truth.current_a.iter().enumerate();
+        let value = value
+            .map(|(row, i)| i + if row > ROWS * 55 / 100 { jump_a } else { 0.0 })
+            .collect();
+        let report = explained(&truth, value, seed, &[]);
+        assert_ne!(report.verdict, Verdict::Explained, "{:?}", report.effects);
+    }
+}

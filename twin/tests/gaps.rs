@@ -146,3 +146,25 @@ fn a_core_and_its_heat_go_on_over_a_gap() {
         assert_goes_on(View::Sensor, &sensor, id, &values);
     }
 }
+
+/// A cell's heat acts through its resistance's law, wherever in the model file that stands.
+#[test]
+fn the_order_of_a_model_file_is_no_physics() {
+    let cell = Base::Battery(BatteryBase {
+        capacity_ah: 3.0,
+        efficiency: 1.0,
+        initial_soc: vec![0.9],
+        ocv: vec![(0.0, 3.0), (1.0, 4.2)],
+        cells: 1.0,
+        resistance_ohm: 0.02,
+        ..BatteryBase::default()
+    });
+    let (problem, _) = problem(View::Voltage, cell, false);
+    let mut effects = vec![
+        ("cell-self-heating".to_owned(), vec![8.0, 120.0]),
+        ("resistance-temperature".to_owned(), vec![4000.0]),
+    ];
+    let one = predict(&problem, &effects);
+    effects.reverse();
+    assert_eq!(one, predict(&problem, &effects));
+}

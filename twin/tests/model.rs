@@ -237,13 +237,58 @@ fn an_effect_that_is_there_gets_the_new_values() {
 fn what_the_sensor_is_off_by_does_not_hide_what_the_battery_is() {
     let mut shift = Shift::default();
     for (alignment_s, soc_shift) in [(0.02, 0.0), (0.0, -0.03), (0.05, 0.01)] {
-        shift.take(Nuisance {
+        let found = Nuisance {
             alignment_s,
             soc_shift,
             ..Nuisance::default()
-        });
+        };
+        shift.take(found, Some(0.8));
     }
     assert_eq!((shift.alignment_s, shift.soc), (0.02, -0.03));
+}
+
+#[test]
+fn a_state_of_charge_that_was_not_stated_is_written_as_it_was_found() {
+    let text = "schema = 1\n[battery]\ncapacity_ah = 2\nocv = [[0, 3], [1, 4]]\n";
+    let here = Path::new(".");
+    let mut shift = Shift::default();
+    let found = Nuisance {
+        soc_shift: -0.05,
+        ..Nuisance::default()
+    };
+    shift.take(found, Some(0.8));
+    let written = parse(text)
+        .unwrap()
+        .extended(&[], shift, here, here)
+        .unwrap();
+    let soc = parse(&written)
+        .unwrap()
+        .battery
+        .unwrap()
+        .initial_soc
+        .unwrap();
+    assert!((soc - 0.75).abs() < 1e-12, "{written}");
+    assert!(written.contains("not stated"), "{written}");
+}
+
+#[test]
+fn an_effect_without_end_is_refused_unless_that_is_what_switches_it_off() {
+    let with = |effect: &str| {
+        parse(&format!(
+            "schema = 1\n[sensor]\nfront_end = \"pair\"\n{effect}\n"
+        ))
+    };
+    for effect in [
+        "[effects.offset]\noffset_a = inf",
+        "[effects.gain]\ngain = -inf",
+        "[effects.lag]\ntau_s = inf",
+        "[effects.lag]\ntau_s = nan",
+        "[effects.clipping]\nhigh_a = -inf\nlow_a = -50",
+    ] {
+        let said = with(effect).unwrap_err().to_string();
+        assert!(said.contains("finite number"), "{effect}: {said}");
+    }
+    with("[effects.clipping]\nhigh_a = inf\nlow_a = -50").unwrap();
 }
 
 #[test]

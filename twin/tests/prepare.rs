@@ -516,3 +516,33 @@ fn a_reference_of_its_own_becomes_the_drive() {
         prepared.remarks
     );
 }
+
+#[test]
+fn a_reference_that_is_missing_masks_its_reading() {
+    let gap = |k: usize| (100..109).contains(&k) || k % 97 == 50;
+    let rows = (0..600).map(|k| {
+        let t = k as f64 * 0.1;
+        let reference = if gap(k) { f64::NAN } else { current(t) };
+        vec![t, reference, 1.02 * current(t)]
+    });
+    let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    let left_out = (0..600).filter(|k| gap(*k)).count();
+    assert_eq!(problem.observed.valid_rows(), 600 - left_out);
+    assert!(problem.observed.on_drive_rows);
+}
+
+#[test]
+fn holding_is_told_where_the_design_says_nothing_of_it() {
+    let held = |model: &str| {
+        let rows = (0..600_i32).map(|k| {
+            let t = f64::from(k) * 0.1;
+            vec![t, current(t), current(f64::from(k / 10))]
+        });
+        one(model, &text("t_s,i_ref_a,i_meas_a", rows))
+            .0
+            .observed
+            .held_s
+    };
+    assert!((held(PAIR) - 1.0).abs() < 1e-9);
+    assert_eq!(held(&format!("{PAIR}interval_s = 1.0\n")), 0.0);
+}

@@ -62,6 +62,7 @@ fn observed(t_s: impl Into<Series>) -> Observed {
     let t_s = t_s.into();
     let rows = t_s.len();
     Observed {
+        held_s: 0.0,
         t_s,
         value: vec![f64::NAN; rows],
         valid: vec![true; rows],
@@ -355,6 +356,29 @@ fn an_extended_model_reproduces_the_explanation() {
         }
         assert!(compared > 1000, "{compared}");
     }
+}
+
+/// What the effects of a model file add to the current, the board's meter counts.
+#[test]
+fn the_meter_counts_what_effects_add() {
+    let folder = tempfile::tempdir().unwrap();
+    let charge = |effects: &str| {
+        let text = format!("schema = 1\n[sensor]\nfront_end = \"dual-range\"\n{effects}");
+        let (model, prepared) = prepared(folder.path(), &text, &recording(), Purpose::Simulate);
+        let written = columns(&model, &prepared);
+        let counted = written.iter().find(|(name, _)| name == "q_meas_c").unwrap();
+        (
+            *counted.1.last().unwrap(),
+            *prepared.t_s.last().unwrap() - prepared.t_s[0],
+        )
+    };
+    let (plain, span_s) = charge("");
+    let (extended, _) = charge("[effects.offset]\noffset_a = 5\n");
+    let added = extended - plain;
+    assert!(
+        (added - 5.0 * span_s).abs() < 1e-3 * added,
+        "{added} C in {span_s} s"
+    );
 }
 
 #[test]

@@ -22,7 +22,7 @@ static CARD: Card = Card {
     shows: "slow under load, where no cell temperature is recorded",
     looks_like: &["resistance-temperature"],
     separated_by: "the temperature of the cell",
-    stage: Stage::BatteryTemperature,
+    stage: Stage::BatteryHeat,
 };
 
 impl Effect for CellSelfHeating {

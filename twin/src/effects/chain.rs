@@ -242,7 +242,7 @@ impl<'a> Chain<'a> {
             Base::Battery(_) => {
                 through(&mut order, Stage::BatteryCharge);
                 order.push(Link::Count);
-                through(&mut order, Stage::BatteryTemperature);
+                through(&mut order, Stage::BatteryHeat);
                 order.push(Link::Warm);
                 through(&mut order, Stage::BatteryVoltage);
                 order.extend([Link::Terminals, Link::Sample]);

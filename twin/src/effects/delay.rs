@@ -1,7 +1,7 @@
 //! Transport delay.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced, within_a_period};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -38,6 +38,10 @@ impl Effect for Delay {
 
     fn idealised(&self) -> f64 {
         0.0
+    }
+
+    fn when_held(&self, values: &[f64], held_s: f64) -> Option<&'static str> {
+        within_a_period(values[0], held_s)
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

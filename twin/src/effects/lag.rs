@@ -1,7 +1,7 @@
 //! First-order low-pass.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced, within_a_period};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -32,6 +32,10 @@ impl Effect for Lag {
             .into_iter()
             .map(|tau| vec![tau])
             .collect()
+    }
+
+    fn when_held(&self, values: &[f64], held_s: f64) -> Option<&'static str> {
+        within_a_period(values[0], held_s)
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

@@ -1,7 +1,7 @@
 //! Boxcar window.
 
 use super::scene::{Scale, Scene, boxcar};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced, within_a_period};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -33,6 +33,10 @@ impl Effect for MovingAverage {
             .into_iter()
             .map(|window| vec![window])
             .collect()
+    }
+
+    fn when_held(&self, values: &[f64], held_s: f64) -> Option<&'static str> {
+        within_a_period(values[0], held_s)
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

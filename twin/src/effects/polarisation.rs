@@ -86,6 +86,11 @@ impl Effect for Polarisation {
         self.card.parameters.len() > 2
     }
 
+    fn ordered(&self, values: &mut [f64]) {
+        let branches = values.as_chunks_mut::<2>().0;
+        branches.sort_by(|[_, one_s], [_, other_s]| one_s.total_cmp(other_s));
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (drive, steps) = (scene.drive, scene.steps.clone());
         let Some(battery) = &mut scene.battery else {

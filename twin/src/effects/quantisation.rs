@@ -50,6 +50,12 @@ impl Effect for Quantisation {
         true
     }
 
+    /// Behind a staircase noise takes readings off its levels.
+    fn noise_ahead(&self, values: &[f64], clues: &Clues<'_>) -> bool {
+        let known = || clues.observed.iter().copied().filter(|y| y.is_finite());
+        !lattice(clues.observed).is_empty() || concentration(known(), values[0]) > ON_GRID
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let step = values[0];
         if step > 0.0 {
@@ -63,6 +69,8 @@ impl Effect for Quantisation {
 
 /// Readings that are looked at.
 const ENOUGH: usize = 4000;
+/// Concentration from which on values are on a grid: what is off it is less than a twentieth of a step.
+const ON_GRID: f64 = 0.95;
 /// A gap is this share off the step at most.
 const OFF: f64 = 0.2;
 /// Sums that are kept side by side.
@@ -85,15 +93,7 @@ fn lattice(observed: &[f64]) -> Vec<f64> {
     gaps.sort_unstable_by(f64::total_cmp);
     let least = gaps[gaps.len() / 20];
     let span = sorted[sorted.len() - 1] - sorted[0];
-    let concentration = |step: f64| {
-        let (mut cosine, mut sine) = (0.0, 0.0);
-        for value in &sorted {
-            let turns = value / step * std::f64::consts::TAU;
-            cosine += turns.cos();
-            sine += turns.sin();
-        }
-        f64::hypot(cosine, sine) / sorted.len() as f64
-    };
+    let concentration = |step: f64| concentration(sorted.iter().copied(), step);
     // The gap is known to rounding only: over the span the grid has to stay in step.
     let fine = 0.1 * least / span.max(least);
     let best = (-200..=200)
@@ -102,9 +102,21 @@ fn lattice(observed: &[f64]) -> Vec<f64> {
         .filter(|share| share.abs() < OFF)
         .map(|share| least * (1.0 + share))
         .max_by(|a, b| concentration(*a).total_cmp(&concentration(*b)));
-    best.filter(|step| concentration(*step) > 0.95)
+    best.filter(|step| concentration(*step) > ON_GRID)
         .into_iter()
         .collect()
+}
+
+/// How well values keep to a grid of a step, 0 … 1: the mean of unit vectors at their place within a step.
+fn concentration(values: impl Iterator<Item = f64>, step: f64) -> f64 {
+    let (mut cosine, mut sine, mut count) = (0.0, 0.0, 0.0);
+    for value in values {
+        let turns = value / step * std::f64::consts::TAU;
+        cosine += turns.cos();
+        sine += turns.sin();
+        count += 1.0;
+    }
+    f64::hypot(cosine, sine) / f64::max(count, 1.0)
 }
 
 /// The step whose staircase goes best with the residual.

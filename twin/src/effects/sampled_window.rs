@@ -234,6 +234,9 @@ fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
         .collect();
     let stride = t_s.len().div_ceil(ENOUGH).max(1);
     let rows = || (0..t_s.len()).step_by(stride);
+    let (rr, or) = rows().fold((0.0, 0.0), |(rr, or), row| {
+        (rr + rate[row] * rate[row], or + off[row] * rate[row])
+    });
     let mut found: Vec<(f64, [f64; 4])> = Vec::new();
     for line in spectrum::strongest(&t_s, &course, step, LINES) {
         if line * span < CYCLES {
@@ -245,14 +248,12 @@ fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
             // Ages rise at the beat, or fall: where the period is a little shorter, or longer, than what fits into a row.
             for (way, phase) in [(1.0, turns - 0.25), (-1.0, -turns - 0.25)] {
                 for phase in [phase - 0.04, phase, phase + 0.04] {
-                    let (mut rr, mut ra, mut aa, mut or, mut oa) = (0.0, 0.0, 0.0, 0.0, 0.0);
+                    let (mut ra, mut aa, mut oa) = (0.0, 0.0, 0.0);
                     for row in rows() {
                         let turns = way * beat * t_s[row] + phase;
                         let age = rate[row] * (turns - floored(turns));
-                        rr += rate[row] * rate[row];
                         ra += rate[row] * age;
                         aa += age * age;
-                        or += off[row] * rate[row];
                         oa += off[row] * age;
                     }
                     let whole = rr * aa - ra * ra;

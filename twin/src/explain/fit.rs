@@ -597,6 +597,15 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
             break;
         }
     }
+    if here.model.held.is_none() {
+        for member in &mut here.model.members {
+            let found = member.values.clone();
+            member.effect.ordered(&mut member.values);
+            if member.values != found {
+                known = None;
+            }
+        }
+    }
     let cost = Aim { bench, sigma, used }.cost(&here.model, &here.residual);
     if used.is_none() {
         bench.remember(from, &here.model, sigma, cost);

@@ -149,10 +149,10 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
     let as_read = bench.as_read(&fit.predicted);
     let candidates: Vec<(&'static dyn Effect, Vec<f64>)> = bench
         .library
-        .iter()
+        .par_iter()
         .copied()
         .filter(|effect| may_join(&fit.model, *effect))
-        .flat_map(|effect| {
+        .flat_map_iter(|effect| {
             let clues = bench.clues(&as_read);
             effect
                 .starts(&bench.scale, &clues)

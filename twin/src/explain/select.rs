@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::fit::{Fit, change, dot, fit, held_out, huber, polish};
+use super::fit::{Fit, change, dot, fit, held_out, huber, loss, polish};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search, Stage, find};
@@ -739,8 +739,8 @@ fn pair(
     // A masked effect shows once the other is fitted: from each of the best single ones one goes a step further.
     let firsts = promising(bench, now, &screening.entries, FIRSTS, 1);
     let models: Vec<Model> = fits(bench, firsts)
-        .iter()
-        .flat_map(|first| {
+        .par_iter()
+        .flat_map_iter(|first| {
             let taken = share(bench, now, first).max(0.0);
             let mut entries = screen(bench, first, 0, 0).entries;
             entries.retain(|entry| taken + entry.gain * (1.0 - taken) > STARTED * least);
@@ -914,10 +914,9 @@ fn rivals(
     let screening = screen(bench, without, 0, 0);
     let mut members: Vec<Member> = Vec::new();
     let mut count: Vec<(&'static str, usize)> = Vec::new();
-    let near = |entry: &&Entry| entry.gain > RIVALS * taken;
-    for (rank, entry) in screening.entries.iter().take_while(near).enumerate() {
+    for (rank, entry) in screening.entries.iter().enumerate() {
         let other = entry.member.effect;
-        if other.card().id == id || model.has(other.card().id) {
+        if entry.gain <= RIVALS * taken || other.card().id == id || model.has(other.card().id) {
             continue;
         }
         let known = count
@@ -933,6 +932,36 @@ fn rivals(
             None => count.push((other.card().id, 1)),
         }
         members.push(entry.member.clone());
+    }
+    // Where few rows show the effect (an edge or two), the gain of a start says little of what its fit will be worth: of what looks
+    // like it, the starts that come nearest to the readings as they are, too.
+    let as_read = bench.as_read(&without.predicted);
+    let clues = bench.clues(&as_read);
+    for effect in bench.library.iter().copied().filter(alike) {
+        if model.has(effect.card().id) {
+            continue;
+        }
+        let mut starts: Vec<(f64, Member)> = effect
+            .starts(&bench.scale, &clues)
+            .into_par_iter()
+            .map(|values| {
+                let member = Member { effect, values };
+                let there = bench.run(&without.model.with(member.clone()));
+                (loss(&bench.residual(&there), without.sigma), member)
+            })
+            .collect();
+        starts.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let nearest = starts.into_iter().take(STARTS).map(|(_, member)| member);
+        members.extend(
+            nearest
+                .filter(|member| {
+                    members.iter().all(|known| {
+                        known.effect.card().id != member.effect.card().id
+                            || known.values != member.values
+                    })
+                })
+                .collect::<Vec<_>>(),
+        );
     }
     members
 }
@@ -1024,7 +1053,11 @@ fn plainer(
                             && at_end(bench, member).is_none()
                     }) && !beaten(bench, fit, now)
                 })
-                .min_by(|a, b| a.cost.total_cmp(&b.cost))
+                // In one spread for all: in its own, a bad fit's residual is a small one.
+                .min_by(|a, b| {
+                    let sigma = a.sigma.min(b.sigma);
+                    loss(&a.residual, sigma).total_cmp(&loss(&b.residual, sigma))
+                })
                 .map(|fit| (one.index, fit.clone()))
         })
 }
@@ -1057,6 +1090,14 @@ fn name(
                 })
                 .filter_map(|(_, other)| other.model.members.last().map(Member::id))
                 .collect();
+            let member = &now.model.members[index];
+            let held_s = bench.problem.observed.held_s;
+            equivalent.extend(
+                member
+                    .effect
+                    .when_held(&member.values, held_s)
+                    .filter(|_| held_s > 0.0),
+            );
             equivalent.sort_unstable();
             equivalent.dedup();
             Named {
@@ -1070,7 +1111,7 @@ fn name(
 }
 
 /// Whether a model's held-out loss is higher than the chosen one's by more than chance, stretch against stretch.
-fn beaten(bench: &Workbench<'_>, other: &Fit, chosen: &Fit) -> bool {
+pub fn beaten(bench: &Workbench<'_>, other: &Fit, chosen: &Fit) -> bool {
     let sigma = chosen.sigma.min(other.sigma);
     let (theirs, _) = losses(bench, other, sigma);
     let (ours, _) = losses(bench, chosen, sigma);

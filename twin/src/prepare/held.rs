@@ -5,6 +5,9 @@ use super::series::median;
 
 /// Share of repeats, while the reference moves, from which a sensor is read more often than it measures.
 const HELD_SHARE: f64 = 0.2;
+/// A value is measured again after this many intervals at the latest: half an interval is what the time of either may be off by. A
+/// little less, for where rows are a whole part of the interval, rounding of the time stamps is not to decide.
+const AGAIN: f64 = 1.5 - 1e-4;
 /// The reference moves if it changes by this many of the sensor's own steps.
 const MOVING_STEPS: f64 = 2.0;
 
@@ -113,7 +116,7 @@ pub fn freshness(
         }
         before_row = after;
         let since = t_s[after] - last_fresh;
-        if value[after] != value[before] || since >= 1.5 * interval_s {
+        if value[after] != value[before] || since >= AGAIN * interval_s {
             fresh[after] = true;
             last_fresh = t_s[after];
         }

@@ -52,6 +52,15 @@ pub fn with_interval(value: f64, interval: [f64; 2]) -> [String; 3] {
     let half = format!("{half:.1e}");
     let place = exponent_of(&half) - i32::from(half.starts_with(['1', '2', '3', '4']));
     let exponent = exponent_of(&format!("{size:.1e}"));
+    let least = [value, low, high]
+        .map(f64::abs)
+        .into_iter()
+        .filter(|number| *number > 0.0)
+        .fold(f64::INFINITY, f64::min);
+    // Over more than four decades the place of the largest is none for the smallest.
+    if size > 1e4 * least {
+        return [value, low, high].map(|number| significant(number, 2));
+    }
     if !(-4..6).contains(&exponent) {
         let digits = (exponent - place).max(0) as usize;
         // One exponent for the three: they are read against each other.
@@ -132,6 +141,10 @@ pub fn place(location: &Location) -> String {
         (Some(from), Some(to)) if from == to => format!("{variable} = {}", end(from)),
         (Some(from), Some(to)) => format!("{variable} {} … {}", at_most(from, 4), end(to)),
         (Some(from), None) => format!("{variable} > {}", end(from)),
+        // A size is never below 0.
+        (None, Some(to)) if to <= 0.0 && variable.starts_with("abs(") => {
+            format!("{variable} = {}", end(0.0))
+        }
         (None, Some(to)) => format!("{variable} < {}", end(to)),
         (None, None) => format!("{variable}: everywhere"),
     }

@@ -11,7 +11,7 @@ use crate::{
     failure::Failure,
     model::Model,
     overwrite,
-    prepare::{Inputs, Item, Prepared, Purpose, prepare},
+    prepare::{Inputs, Item, Prepared, Purpose, modelled_change, prepare},
     problem::{Base, Problem, View},
     progress::Progress,
 };
@@ -153,8 +153,7 @@ fn counter(model: &Model, prepared: &Prepared) -> Option<Vec<f64>> {
             .charge_c;
         if !problem.modelled.is_empty() {
             // What the effects add to the current, the meter counts too.
-            let (designed, extended) = (super::designed(problem), predicted(item));
-            let added: Vec<f64> = extended.iter().zip(designed).map(|(e, d)| e - d).collect();
+            let added = modelled_change(problem);
             charge_c
                 .iter_mut()
                 .zip(integral_c(problem, &added))
