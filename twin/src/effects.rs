@@ -323,6 +323,11 @@ pub trait Effect: Sync {
         None
     }
 
+    /// By how much an internal parameter comes round: where in a turn a file begins is no property of the physics.
+    fn turn(&self, _values: &[f64]) -> Option<f64> {
+        None
+    }
+
     /// What follows from the values, in plain words.
     fn consequences(&self, _values: &[f64], _problem: &Problem) -> Vec<String> {
         Vec::new()

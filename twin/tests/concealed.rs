@@ -637,3 +637,48 @@ fn a_jump_of_the_zero_is_no_staircase() {
         assert_ne!(report.verdict, Verdict::Explained, "{:?}", report.effects);
     }
 }
+
+/// Where in its turn a ripple stands when a file begins is that file's own.
+#[test]
+fn a_ripple_of_another_phase_is_the_same_ripple() {
+    let truth = truth();
+    let file = |phase: f64, seed| {
+        let mut noise = noise(seed, NOISE_A);
+        let ripple = |t: f64| 0.8 * (std::f64::consts::TAU * 1.237 * t + phase).sin();
+        let rows = truth.current_a.iter().zip(&truth.t_s);
+        let value = rows.map(|(i, t)| i + ripple(*t) + noise()).collect();
+        problem_of(&truth, value, Coloured::default())
+    };
+    let holdout = Holdout {
+        file: "other.csv".into(),
+        problems: vec![file(2.5, 82)],
+    };
+    let report = explain(
+        &[file(0.0, 81)],
+        &[holdout],
+        &Options::default(),
+        &mut |_, _| {},
+    );
+    assert_named(
+        &report,
+        "hum",
+        &[("frequency_hz", 1.237, 1e-3), ("amplitude_a", 0.8, 0.05)],
+    );
+    let there = &report.holdouts[0];
+    assert!(there.rmse_after < 1.05 * NOISE_A, "{there:?}");
+}
+
+/// Where the model file states no noise, a few wild readings do not set the measure by which they are none.
+#[test]
+fn wild_readings_are_no_agreement() {
+    let truth = truth();
+    let mut noise = noise(91, 0.02);
+    let mut value: Vec<f64> = truth.current_a.iter().map(|i| i + noise()).collect();
+    for (count, row) in [1234, 4321, 7000].into_iter().enumerate() {
+        value[row] = 6553.5;
+        let mut problem = problem_of(&truth, value.clone(), Coloured::default());
+        problem.noise = 0.0;
+        let report = said(problem, 91, &[]);
+        assert_eq!(report.verdict, Verdict::Unknown, "{}", count + 1);
+    }
+}

@@ -54,6 +54,10 @@ impl Effect for Hum {
             .collect()
     }
 
+    fn turn(&self, _values: &[f64]) -> Option<f64> {
+        Some(std::f64::consts::TAU)
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (turns_hz, amplitude, phase) =
             (values[0] * std::f64::consts::TAU, values[1], values[2]);

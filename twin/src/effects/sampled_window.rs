@@ -113,6 +113,10 @@ impl Effect for SampledWindow {
         Some(near)
     }
 
+    fn turn(&self, values: &[f64]) -> Option<f64> {
+        Some(values[0])
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (period, duty, phase) = (values[0], values[1], values[2]);
         let drive = scene.drive;
