@@ -22,8 +22,8 @@ use crate::effects::scene::Scale;
 use crate::effects::{Effect, IDEALISED, Search, find, find_with};
 use crate::problem::{Base, Coloured, Problem};
 use crate::report::data::{
-    EffectReport, FittedModel, HoldoutReport, Location, ParameterReport, Report, SignalPlots,
-    SignalReport, Unexplained, Verdict,
+    EffectReport, FittedModel, HoldoutReport, Location, LocationKind, ParameterReport, Report,
+    SignalPlots, SignalReport, Unexplained, Verdict,
 };
 use crate::spectrum;
 use fit::Fit;
@@ -77,6 +77,8 @@ const CONFIRMED: f64 = 0.6;
 const VAGUE: f64 = 100.0;
 /// Starts of an effect that are fitted in another's place; of more the nearest.
 const STAND_INS: usize = 12;
+/// Share of what is in a band of frequency from which on an effect reaches it.
+const REACHES: f64 = 0.1;
 /// Places in a turn that are tried for a file that was never fitted.
 const PHASES: f64 = 24.0;
 /// Folds for the figures of held-out blocks, each with a fit of its own.
@@ -1173,6 +1175,18 @@ fn attribute(bench: &Workbench<'_>, fit: &Fit, locations: &mut [Location]) {
         .collect();
     let variables = locate::variables(bench);
     for location in locations {
+        if location.kind == LocationKind::Frequency {
+            let energy = |change: &[f64]| locate::energy_in_band(bench, location, change);
+            let there = energy(&fit.residual) + changes.iter().map(|(_, c)| energy(c)).sum::<f64>();
+            // An effect that hardly reaches a band is not why it stands out.
+            location.effect = changes
+                .iter()
+                .map(|(id, change)| (*id, energy(change)))
+                .filter(|(_, energy)| *energy > REACHES * there)
+                .max_by(|a, b| a.1.total_cmp(&b.1))
+                .map(|(id, _)| id.to_owned());
+            continue;
+        }
         let here: Vec<usize> = (0..bench.len())
             .filter(|&row| locate::within(bench, location, &variables, row).unwrap_or(true))
             .collect();

@@ -682,3 +682,25 @@ fn wild_readings_are_no_agreement() {
         assert_eq!(report.verdict, Verdict::Unknown, "{}", count + 1);
     }
 }
+
+/// Noise with a memory that nobody states makes a constant no less constant.
+#[test]
+fn a_constant_in_slow_noise_is_constant() {
+    let truth = truth();
+    let kept = f64::exp(-STEP_S / 5.0);
+    for (seed, stated) in [(101, 0.0), (102, 0.0), (103, NOISE_A), (104, NOISE_A)] {
+        let mut noise = noise(seed, NOISE_A);
+        let mut memory = 0.0;
+        let value = truth
+            .current_a
+            .iter()
+            .map(|i| {
+                memory = kept * memory + (1.0 - kept * kept).sqrt() * noise();
+                i + 2.0 + memory
+            })
+            .collect();
+        let mut problem = problem_of(&truth, value, Coloured::default());
+        problem.noise = stated;
+        assert_named(&said(problem, seed, &[]), "offset", &[("offset_a", 2.0, 0.3)]);
+    }
+}

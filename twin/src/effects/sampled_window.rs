@@ -30,7 +30,7 @@ static CARD: Card = Card {
         Parameter::internal("phase_s", "s", 0.0, Search::Stepped),
     ],
     shows: "beats with periodic loads",
-    looks_like: &["moving-average", "delay", "lag", "gain"],
+    looks_like: &["moving-average", "delay", "lag", "gain", "clock-skew"],
     separated_by: "a load that switches with a period near that of the window",
     stage: Stage::Converter,
 };

@@ -34,6 +34,10 @@ const JUMP: f64 = 2.0;
 /// truth: of a two-sided random walk on a parabola (Chernoff's distribution, as of a threshold that noise crosses both ways), by
 /// 4,000 simulated walks.
 const CHANCE: f64 = 2.5;
+/// What is left is noise alone up to this multiple of the stated noise.
+const NOISE_ALONE: f64 = 1.1;
+/// Lags at which noise is asked how much it remembers.
+const LAGS: usize = 16;
 /// Steps to each side when the end of a profile is looked for.
 const OUTWARD: usize = 40;
 /// Halvings that narrow the end down.
@@ -199,6 +203,11 @@ pub fn variations(bench: &Workbench<'_>, fit: &Fit) -> Vec<Variation> {
     let rest = solve(&whole, &right, 1e-9);
     let freedom = fit.residual.len().saturating_sub(slope.len()).max(1) as f64;
     let loudness = 2.0 * loss(&fit.residual, fit.sigma) / freedom;
+    // Where the model file states a memory, or what is left is more than the noise that it states, that is no noise of its own.
+    let noise = bench.problem.noise;
+    let left = dot(&fit.residual, &fit.residual) / freedom;
+    let forgets =
+        bench.coloured().rms > 0.0 || (noise > 0.0 && left > (NOISE_ALONE * noise).powi(2));
     let members = fit.model.members.iter().enumerate();
     members
         .map(|(m, member)| {
@@ -206,6 +215,11 @@ pub fn variations(bench: &Workbench<'_>, fit: &Fit) -> Vec<Variation> {
                 .filter_map(|p| slope.index(m, p))
                 .collect();
             let (mut taken, mut expected, mut variance) = (0.0, 0.0, 0.0);
+            let remembered = if forgets {
+                vec![1.0; own.len()]
+            } else {
+                memories(fit, &slope, &weights, &own, (&parts, &stretches))
+            };
             for ((matrix, side), rows) in parts.iter().zip(&stretches) {
                 let score = side - matrix * &rest;
                 let score = DVector::from_fn(own.len(), |a, _| score[own[a]]);
@@ -213,13 +227,14 @@ pub fn variations(bench: &Workbench<'_>, fit: &Fit) -> Vec<Variation> {
                 taken += score.dot(&solve(&here, &score, 1e-12));
                 let by_noise: f64 = own
                     .iter()
-                    .filter(|&&k| matrix[(k, k)] > 0.0)
-                    .map(|&k| {
+                    .zip(&remembered)
+                    .filter(|(k, _)| matrix[(**k, **k)] > 0.0)
+                    .map(|(&k, remembered)| {
                         let column = &slope.columns[k][rows.clone()];
                         let weighted = column.iter().zip(&weights[rows.clone()]);
                         let weighted: Vec<f64> = weighted.map(|(c, w)| c * w).collect();
                         let stated = bench.carried(rows.start, &weighted).unwrap_or(0.0);
-                        loudness.max(stated / matrix[(k, k)])
+                        (remembered * loudness).max(stated / matrix[(k, k)])
                     })
                     .sum();
                 expected += by_noise;
@@ -232,6 +247,71 @@ pub fn variations(bench: &Workbench<'_>, fit: &Fit) -> Vec<Variation> {
                 deviations: (taken - expected) / variance.sqrt().max(1e-300),
                 share: (taken - expected).max(0.0) * fit.sigma * fit.sigma / energy,
             }
+        })
+        .collect()
+}
+
+/// By how many times the variance of each coordinate's score over a stretch is that of as many independent rows, at least 1: from the
+/// autocovariance γ of the scores within stretches, all stretches together. With what each stretch would have of its own taken off,
+/// γ is lower than noise's by the variance v of a stretch's mean at every lag; noise that forgets within half a stretch leaves −v at
+/// the lags behind that, and n·v is what a stretch's sum has.
+fn memories(
+    fit: &Fit,
+    slope: &Slope,
+    weights: &[f64],
+    own: &[usize],
+    (parts, stretches): (&[Part], &[Range<usize>]),
+) -> Vec<f64> {
+    let length = fit.residual.len() / stretches.len().max(1);
+    let lags: Vec<usize> = (length / 2..3 * length / 4)
+        .step_by((length / (4 * LAGS)).max(1))
+        .collect();
+    if lags.is_empty() {
+        return vec![1.0; own.len()];
+    }
+    let (mut squares, mut apart) = (vec![0.0; own.len()], vec![0.0; own.len()]);
+    let (mut rows_of_squares, mut rows_apart) = (0.0, 0.0);
+    for ((matrix, side), rows) in parts.iter().zip(stretches) {
+        let score = DVector::from_fn(own.len(), |a, _| side[own[a]]);
+        let here = DMatrix::from_fn(own.len(), own.len(), |a, b| matrix[(own[a], own[b])]);
+        let step = solve(&here, &score, 1e-12);
+        let left: Vec<f64> = rows
+            .clone()
+            .map(|row| {
+                let moved: f64 = own
+                    .iter()
+                    .zip(step.iter())
+                    .map(|(k, step)| slope.columns[*k][row] * step)
+                    .sum();
+                weights[row] * (fit.residual[row] - moved)
+            })
+            .collect();
+        rows_of_squares += left.len() as f64;
+        rows_apart += lags
+            .iter()
+            .map(|lag| left.len().saturating_sub(*lag) as f64)
+            .sum::<f64>();
+        for (a, k) in own.iter().enumerate() {
+            let column = &slope.columns[*k][rows.clone()];
+            let scores: Vec<f64> = column.iter().zip(&left).map(|(c, r)| c * r).collect();
+            squares[a] += dot(&scores, &scores);
+            for lag in &lags {
+                let later = scores.get(*lag..).unwrap_or_default();
+                apart[a] += scores
+                    .iter()
+                    .zip(later)
+                    .map(|(one, other)| one * other)
+                    .sum::<f64>();
+            }
+        }
+    }
+    squares
+        .iter()
+        .zip(&apart)
+        .map(|(squares, apart)| {
+            let of_mean = (-apart / rows_apart.max(1.0)).max(0.0);
+            let all = squares / rows_of_squares.max(1.0) + of_mean;
+            (length as f64 * of_mean / all.max(1e-300)).max(1.0)
         })
         .collect()
 }

@@ -1,5 +1,6 @@
 //! Where the mismatch sits: the stretch of time, the operating region and the band of frequency that hold more of its energy
-//! than of the samples, each with a p-value from block permutation.
+//! than of the samples, each with a p-value: of time and region from block permutation, of frequency from the noise that the model
+//! file states, or from rows in any order where it states no memory.
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
@@ -11,6 +12,10 @@ use crate::spectrum;
 
 /// Permutations.
 const DRAWS: usize = 200;
+/// Drawings of noise that a band of frequency is compared with, and of how many for recordings of more rows than [`LONG`].
+const BANDS_DRAWS: u32 = 99;
+const FEW_DRAWS: u32 = 20;
+const LONG: usize = 20_000;
 /// Quantiles at which a range may begin or end.
 const EDGES: [f64; 11] = [0.0, 0.02, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.98, 1.0];
 /// Stretches of time that are tried: this many of equal length, and runs of them.
@@ -333,12 +338,7 @@ fn stretch(
 }
 
 fn band(bench: &Workbench<'_>, residual: &[f64], random: &mut ChaCha8Rng) -> Option<Location> {
-    let spectrum = |residual: &[f64]| {
-        spectrum::density(&bench.t_s, residual, bench.scale.reading_step_s, 16)
-            .into_iter()
-            .map(|(from, to, density)| (from, to, density * density * (to - from)))
-            .collect::<Vec<_>>()
-    };
+    let spectrum = |residual: &[f64]| bands(bench, residual);
     let here = spectrum(residual);
     let total: f64 = here.iter().map(|(_, _, energy)| energy).sum();
     let width = here.last().map(|(_, to, _)| *to)? - here.first().map(|(from, _, _)| *from)?;
@@ -362,15 +362,21 @@ fn band(bench: &Workbench<'_>, residual: &[f64], random: &mut ChaCha8Rng) -> Opt
         best
     };
     let (tells, from, to, energy_share) = best(&here);
-    // Without order, residuals are white.
-    let mut mixed = residual.to_vec();
-    let draws = 20;
+    let mut drawn = residual.to_vec();
+    let draws = if bench.len() > LONG {
+        FEW_DRAWS
+    } else {
+        BANDS_DRAWS
+    };
     let above = (0..draws)
         .filter(|_| {
-            for k in (1..mixed.len()).rev() {
-                mixed.swap(k, (random.next_u64() % (k as u64 + 1)) as usize);
+            if !bench.draw_noise(&mut drawn, random) {
+                // Without order, residuals are white.
+                for k in (1..drawn.len()).rev() {
+                    drawn.swap(k, (random.next_u64() % (k as u64 + 1)) as usize);
+                }
             }
-            best(&spectrum(&mixed)).0 >= tells
+            best(&spectrum(&drawn)).0 >= tells
         })
         .count();
     let p_value = (above + 1) as f64 / f64::from(draws + 1);
@@ -387,6 +393,27 @@ fn band(bench: &Workbench<'_>, residual: &[f64], random: &mut ChaCha8Rng) -> Opt
         p_value,
         effect: None,
     })
+}
+
+/// Energy of a series in bands of frequency: from and to, in Hz, and the energy in the view's unit squared.
+fn bands(bench: &Workbench<'_>, series: &[f64]) -> Vec<(f64, f64, f64)> {
+    spectrum::density(&bench.t_s, series, bench.scale.reading_step_s, 16)
+        .into_iter()
+        .map(|(from, to, density)| (from, to, density * density * (to - from)))
+        .collect()
+}
+
+/// Energy of a series within a place that is a band of frequency.
+pub fn energy_in_band(bench: &Workbench<'_>, location: &Location, series: &[f64]) -> f64 {
+    let (from, to) = (
+        location.from.unwrap_or(0.0),
+        location.to.unwrap_or(f64::INFINITY),
+    );
+    bands(bench, series)
+        .into_iter()
+        .filter(|band| band.0 >= from && band.1 <= to)
+        .map(|band| band.2)
+        .sum()
 }
 
 /// Whether a row (an index among those that count) lies in a place; `None` for a band of frequency.

@@ -333,6 +333,29 @@ impl<'a> Workbench<'a> {
             .sum()
     }
 
+    /// Puts a drawing of the noise that the model file states in place of a series; `false`, and nothing done, if that has no memory.
+    pub fn draw_noise(&self, series: &mut [f64], random: &mut ChaCha8Rng) -> bool {
+        let coloured = self.coloured();
+        if !(coloured.rms > 0.0 && coloured.tau_s > 0.0) {
+            return false;
+        }
+        let white = (self.problem.noise.powi(2) - coloured.rms.powi(2))
+            .max(0.0)
+            .sqrt();
+        let mut noise = StandardNormal.sample_iter(random);
+        let mut normal = || -> f64 { noise.next().unwrap_or_default() };
+        let mut memory = coloured.rms * normal();
+        let mut before = None;
+        for (value, t) in series.iter_mut().zip(&self.t_s) {
+            if let Some(before) = before.replace(*t) {
+                let kept = (-f64::max(t - before, 0.0) / coloured.tau_s).exp();
+                memory = kept * memory + coloured.rms * (1.0 - kept * kept).sqrt() * normal();
+            }
+            *value = memory + white * normal();
+        }
+        true
+    }
+
     /// Variance of a weighted sum of readings from a row on, `aᵀΣa`, under the noise that the model file states, with Σ of an
     /// exponential memory and white noise; `None` if it states none with a memory.
     pub fn carried(&self, from: usize, weights: &[f64]) -> Option<f64> {
