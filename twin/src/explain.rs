@@ -982,7 +982,7 @@ fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
 }
 
 /// By how much the mean square of the stated noise that has a memory, in the view's unit squared, can be above the stated one by
-/// chance: over T it has no more than T/2τ independent values (its squares' covariance falls as the square of its own).
+/// chance: over T it has no more than T/τ independent values (its squares' covariance falls as the square of its own).
 fn swing(bench: &Workbench<'_>, coloured: Coloured) -> f64 {
     let span_s = match bench.t_s.as_slice() {
         [first, .., last] if last > first => last - first,

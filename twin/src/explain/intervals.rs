@@ -43,7 +43,7 @@ const OUTWARD: usize = 40;
 /// Halvings that narrow the end down.
 const HALVINGS: usize = 7;
 
-/// Student's 97.5th percentile (Cornish–Fisher's expansion, three digits from three degrees of freedom on).
+/// Student's 97.5th percentile (Cornish–Fisher's expansion, within one percent from three degrees of freedom on).
 pub fn student(freedom: f64) -> f64 {
     let z = NORMAL;
     let (z3, z5, z7) = (z.powi(3), z.powi(5), z.powi(7));
