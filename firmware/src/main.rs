@@ -647,6 +647,10 @@ mod app {
                     readings.configuration_saved =
                         administration.saved == Some(administration.store.generation());
                     readings.storage_busy = administration.request.is_some();
+                    readings.configuration_in_transfer = matches!(
+                        administration.request,
+                        Some(Command::Save | Command::Restore)
+                    );
                     readings.flash_counters = administration.flash_counters;
                     server.serve(now, &readings, &mut administration.store)
                 });
@@ -974,7 +978,8 @@ mod app {
         center: &mut impl rtic::Mutex<T = Center>,
         administration: &mut impl rtic::Mutex<T = Administration>,
     ) -> bool {
-        let done = match administration.lock(|administration| administration.request) {
+        let request = administration.lock(|administration| administration.request);
+        let done = match request {
             None => return false,
             Some(Command::Save) => {
                 let (configuration, generation) = administration.lock(|administration| {
@@ -1011,7 +1016,12 @@ mod app {
             CommandState::Failed
         };
         center.lock(|center| center.measurement.note_command(state, 0));
-        administration.lock(|administration| administration.request = None);
+        administration.lock(|administration| {
+            // An order that has come meanwhile is still to be served.
+            if administration.request == request {
+                administration.request = None;
+            }
+        });
         false
     }
 

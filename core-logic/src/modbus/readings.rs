@@ -76,6 +76,8 @@ readings! {
     activity: Activity,
     /// Flash is being written or erased.
     storage_busy: bool,
+    /// The configuration is being saved or restored, or will be.
+    configuration_in_transfer: bool,
     /// The last command's register value.
     last_command: u16,
     /// How it ended.
