@@ -423,7 +423,7 @@ fields! {
     0x0716 I32 1 Always (0, 500_000) "capacity uncertainty" "ppm" "half-width of the capacity" [at soc.capacity_uncertainty];
     0x0718 U32 1 Always (1, 10_000) "presented slew" "ppm/s" "rate at which the presented state of charge follows an anchoring" [at soc.presented_slew_ppm_per_s];
 
-    0x0780 U16 1 Always (2, MAX_POINTS) "open-circuit points" "" "points in use, from the first" [at ocv.count];
+    0x0781 U16 1 Always (2, MAX_POINTS) "open-circuit points" "" "points in use, from the first; written with the table in one request" [at ocv.count];
     0x0782 I32 21 Always (0, 1_000_000) "open-circuit state of charge" "ppm" "of each point, rising from 0 to 1,000,000" [each ocv.points ; soc];
     0x07AC I32 21 Always (0, 5_000_000) "open-circuit voltage" "µV" "of each point, rising; one cell" [each ocv.points ; voltage];
 
