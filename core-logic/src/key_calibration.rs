@@ -347,6 +347,11 @@ impl KeyCalibration {
         self.factors
     }
 
+    /// Others that a client has set; they hold until some are taken.
+    pub const fn set_factors(&mut self, factors: KeyFactors) {
+        self.factors = factors;
+    }
+
     /// Ends the taking of VC2 of this key cycle; whether it was under way. What follows is what follows on any failure.
     /// With key OFF nothing is under way: VC1 is but kept up to date.
     pub fn cancel(&mut self) -> bool {

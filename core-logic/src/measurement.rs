@@ -264,6 +264,8 @@ pub struct Measurement {
     zero_beyond_limit: bool,
     sweep: Option<SupplyCalibration>,
     key: KeyCalibration,
+    /// The configuration's, as they were last seen: only others replace those in use.
+    key_factors_set: KeyFactors,
     key_outputs: KeyOutputs,
     soc: Soc,
     soc_reading: SocReading,
@@ -463,6 +465,7 @@ impl Measurement {
             zero_beyond_limit: false,
             sweep: None,
             key: KeyCalibration::new(factors, now),
+            key_factors_set: configuration.key_factors,
             key_outputs: KeyOutputs {
                 hv_permit: false,
                 key: KeyState::Off,
@@ -500,6 +503,10 @@ impl Measurement {
     /// owner has to be handed [`Measurement::meter_config`] as well.
     pub fn configuration_changed(&mut self, configuration: &Configuration) {
         let before = self.prepared.soc;
+        if self.key_factors_set != configuration.key_factors {
+            self.key_factors_set = configuration.key_factors;
+            self.key.set_factors(configuration.key_factors);
+        }
         let (factors, supply) = (self.key.factors(), self.prepared.supply);
         self.prepare_again(configuration, factors, supply, self.now);
         self.compare.restart_at(meter_follows(self.now));

@@ -844,6 +844,18 @@ mod app {
         // The next start must not find nothing, nor what is older than this one's.
         let mut first_save = !start.is_in_flash;
         let charge = start.state.map(|state| state.charge_total);
+        let configuration = cx.shared.administration.lock(|administration| {
+            let store = &mut administration.store;
+            // The settings show the factors in use, or a client could not set those that they show.
+            if let Some(state) = &start.state
+                && state.key_factors != store.active().key_factors
+            {
+                let mut staged = *store.active();
+                staged.key_factors = state.key_factors;
+                let _ = store.commit(staged);
+            }
+            *store.active()
+        });
         let crc = configuration.crc();
         let calibration = cx.shared.center.lock(|center| {
             center.identity.configuration_crc = crc;
