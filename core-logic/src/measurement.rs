@@ -1050,10 +1050,9 @@ impl Measurement {
             || self.environment.supply.is_none_or(|supply| {
                 !(design::SENSOR_SUPPLY_LOW..=design::SENSOR_SUPPLY_HIGH).contains(&supply)
             });
+        let [lowest, highest] = configuration.temperature_limits;
         let too_hot_or_cold = |temperature: Option<MilliCelsius>| {
-            temperature.is_some_and(|temperature| {
-                !(design::TEMPERATURE_LOW..=design::TEMPERATURE_HIGH).contains(&temperature)
-            })
+            temperature.is_some_and(|temperature| !(lowest..=highest).contains(&temperature))
         };
         let counters = self.converter.counters();
         let implausible = self.reading.validity.contains(Validity::IMPLAUSIBLE);
