@@ -394,7 +394,7 @@ fields! {
     0x0602 U32 1 Always (1, 1_000_000) "chatter: edges" "" "within one window from which on it is chatter" [at chatter.edges];
     0x0614 I32 1 Always (0, 100_000_000) "flag: margin above" "µA" "beyond the switching current, on the small sensor" [at flag.margin_above];
     0x0616 I32 1 Always (0, 100_000_000) "flag: margin below" "µA" "below the switching current, on the large sensor" [at flag.margin_below];
-    0x0618 I32 1 Always (1, 100_000_000) "flag: match tolerance" "µA" "between readings of one sensor" [at flag.match_tolerance];
+    0x0618 I32 1 Always (500_000, 100_000_000) "flag: match tolerance" "µA" "between readings of one sensor" [at flag.match_tolerance];
     0x061A U32 1 Always (0, 169) "flag: debounce" "ms" "with one conversion on top below 200 ms" [at flag.debounce_ms];
     0x0620 U16 1 Always (1, 10_000) "edge storm: events" "" "within the window" [at edge_storm.events];
     0x0622 U32 1 Always (10, 1_000_000) "edge storm: window" "µs" "" [at edge_storm.window_us];
