@@ -38,6 +38,18 @@ impl StormConfig {
     };
 }
 
+impl StormConfig {
+    /// Shortest window for each event: 20 in a millisecond. More of them would pass unmasked at the cost of all else that
+    /// the processor has to do, the watchdog included.
+    const MIN_US_PER_EVENT: u32 = 50;
+
+    /// Whether no line can take more than its share of the time.
+    #[must_use]
+    pub fn is_valid(&self) -> bool {
+        self.window_us >= u32::from(self.events).saturating_mul(Self::MIN_US_PER_EVENT)
+    }
+}
+
 impl Default for StormConfig {
     fn default() -> Self {
         Self::METER_LINE
@@ -185,6 +197,19 @@ mod tests {
         assert_eq!(guard.on_event(&CONFIG, at(100)), StormAction::Pass);
         assert_eq!(guard.on_event(&CONFIG, at(101)), StormAction::Pass);
         assert_eq!(guard.on_event(&CONFIG, at(102)), StormAction::Mask);
+    }
+
+    #[test]
+    fn twenty_events_a_millisecond_are_the_most() {
+        assert!(StormConfig::RANGE_EDGE.is_valid() && StormConfig::METER_LINE.is_valid());
+        let config = |events, window_us| StormConfig {
+            events,
+            window_us,
+            hold_off_us: 1_000,
+        };
+        assert!(config(100, 5_000).is_valid() && config(10, 500).is_valid());
+        assert!(!config(100, 4_999).is_valid() && !config(11, 500).is_valid());
+        assert!(!config(u16::MAX, 10).is_valid());
     }
 
     #[test]
