@@ -60,7 +60,7 @@ pub enum Contradiction {
     KeyCalibrationDelay,
     /// The slow window of the channels' comparison is not longer than the fast one.
     CompareWindows,
-    /// A storm's window is too short for its events.
+    /// A storm's window or hold-off is too short for its events.
     Storm,
     /// The open-circuit table is not usable.
     Ocv(crate::ocv::OcvTableError),

@@ -39,14 +39,15 @@ impl StormConfig {
 }
 
 impl StormConfig {
-    /// Shortest window for each event: 20 in a millisecond. More of them would pass unmasked at the cost of all else that
-    /// the processor has to do, the watchdog included.
+    /// Shortest window and shortest rest for each event: 20 in a millisecond. More of them would be served at the cost of
+    /// all else that the processor has to do, the watchdog included.
     const MIN_US_PER_EVENT: u32 = 50;
 
     /// Whether no line can take more than its share of the time.
     #[must_use]
     pub fn is_valid(&self) -> bool {
-        self.window_us >= u32::from(self.events).saturating_mul(Self::MIN_US_PER_EVENT)
+        let shortest = u32::from(self.events).saturating_mul(Self::MIN_US_PER_EVENT);
+        self.window_us.min(self.hold_off_us) >= shortest
     }
 }
 
@@ -205,11 +206,13 @@ mod tests {
         let config = |events, window_us| StormConfig {
             events,
             window_us,
-            hold_off_us: 1_000,
+            hold_off_us: 5_000,
         };
         assert!(config(100, 5_000).is_valid() && config(10, 500).is_valid());
         assert!(!config(100, 4_999).is_valid() && !config(11, 500).is_valid());
         assert!(!config(u16::MAX, 10).is_valid());
+        let long_window = config(101, 1_000_000);
+        assert!(!long_window.is_valid());
     }
 
     #[test]

@@ -398,10 +398,10 @@ fields! {
     0x061A U32 1 Always (0, 169) "flag: debounce" "ms" "with one conversion on top below 200 ms" [at flag.debounce_ms];
     0x0620 U16 1 Always (1, 100) "edge storm: events" "" "within the window" [at edge_storm.events];
     0x0622 U32 1 Always (500, 1_000_000) "edge storm: window" "µs" "at least 50 µs for each of the events" [at edge_storm.window_us];
-    0x0624 U32 1 Always (500, 1_000_000) "edge storm: hold-off" "µs" "for which the line stays masked" [at edge_storm.hold_off_us];
+    0x0624 U32 1 Always (500, 1_000_000) "edge storm: hold-off" "µs" "for which the line stays masked; at least 50 µs for each of the events" [at edge_storm.hold_off_us];
     0x0628 U16 1 Always (1, 100) "meter line storm: events" "" "within the window" [at meter_line_storm.events];
     0x062A U32 1 Always (500, 1_000_000) "meter line storm: window" "µs" "at least 50 µs for each of the events" [at meter_line_storm.window_us];
-    0x062C U32 1 Always (500, 1_000_000) "meter line storm: hold-off" "µs" "for which the line stays masked" [at meter_line_storm.hold_off_us];
+    0x062C U32 1 Always (500, 1_000_000) "meter line storm: hold-off" "µs" "for which the line stays masked; at least 50 µs for each of the events" [at meter_line_storm.hold_off_us];
     0x0640 U32 1 Always (100, 60_000) "channels: fast window" "ms" "over which meter and converter are compared" [at compare.fast_window_ms];
     0x0642 U32 1 Always (100, 600_000) "channels: slow window" "ms" "the same with the finer bound; longer than the fast one" [at compare.slow_window_ms];
     0x0644 I32 1 Always (0, 500_000) "channels: gain tolerance" "ppm" "share by which they may differ" [at compare.gain_tolerance];
