@@ -4,7 +4,7 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
-use core_logic::can::layout::{MESSAGES, Message};
+use core_logic::can::layout::{Direction, MESSAGES, Message};
 use emulator::can_frame::CanFrame;
 use emulator::faults::Fault;
 use emulator::mcu::rcc::ResetCause;
@@ -68,6 +68,37 @@ fn current_frames_keep_their_period_under_load() {
         "{period:?}"
     );
     assert!(!rig.take_rs485().is_empty());
+}
+
+/// `GenMsgStartDelayTime` of can/board.dbc, which is compared with these headers: counted from the first `Current`.
+#[test]
+fn each_message_first_goes_out_when_the_dbc_says() {
+    let firmware = firmware();
+    let mut rig = Rig::new(&firmware, driving(10.0)).unwrap();
+    let mut first_ms = [None; MESSAGES.len()];
+    for ms in 0..1_500_u32 {
+        rig.run_s(0.001).unwrap();
+        for (message, first_ms) in MESSAGES.iter().zip(&mut first_ms) {
+            if rig.view.period(message.name).frames > 0 {
+                first_ms.get_or_insert(ms);
+            }
+        }
+    }
+    let begin_ms = first_ms[0].unwrap();
+    assert_eq!(MESSAGES[0].name, "Current");
+    for (message, first_ms) in MESSAGES.iter().zip(first_ms) {
+        if message.header.direction == Direction::Received {
+            continue;
+        }
+        // Up to four frames of 0.25 ms in one tick, and the look every millisecond.
+        let delay_ms = first_ms.unwrap() - begin_ms;
+        let expected_ms = u32::from(message.header.phase_ms);
+        assert!(
+            (expected_ms..=expected_ms + 2).contains(&delay_ms),
+            "{}: {delay_ms} ms",
+            message.name
+        );
+    }
 }
 
 /// A frame is given up after 20 ms on a bus that others fill. Some are on the bus in just that moment, and go out.
