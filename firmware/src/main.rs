@@ -124,6 +124,8 @@ mod app {
     const TICK_MS: u32 = 10;
     /// Idle looks for late tasks at most this often.
     const IDLE_LOOK_US: u32 = 10_000;
+    /// Time between two tries to wake a flash that has not answered.
+    const FLASH_RETRY_MS: u32 = 1_000;
     /// Time between two log records when nothing happens.
     const LOG_PERIOD_MS: u32 = 10_000;
     /// Stack that has to stay free.
@@ -824,12 +826,19 @@ mod app {
         let storage = cx.local.storage;
         let (mut stored, mut state) = (Stored::Refused, Stored::Refused);
         let load = async {
-            storage.start().await;
+            // A chip that answers late or wrongly once, or still erases, must not cost the calibration.
+            while !storage.start().await {
+                alive(Task::Storage);
+                Mono::delay(1.millis()).await;
+            }
             stored = storage.configuration().await;
             state = storage.state().await;
         };
         // What has not come in time counts as refused.
         let _ = Mono::timeout_after(LOAD_LIMIT_MS.millis(), load).await;
+        if !storage.is_ready() {
+            defmt::error!("flash not ready");
+        }
         let now = time::now();
 
         let configuration = cx.shared.administration.lock(|administration| {
@@ -860,6 +869,7 @@ mod app {
         let calibration = cx.shared.center.lock(|center| {
             center.identity.configuration_crc = crc;
             center.conditions.flash_fault |= start.is_refused;
+            center.conditions.flash_missing = !storage.is_ready();
             if matches!(stored, Stored::Refused) {
                 center
                     .conditions
@@ -885,12 +895,19 @@ mod app {
 
         let mut policy = SavePolicy::new(now, charge.unwrap_or(Nanocoulombs::ZERO));
         let mut since_log_ms = 0;
+        let mut since_start_ms = 0;
         let mut clearing = false;
         loop {
             let turn_ms = if clearing { 10 } else { 100 };
             Mono::delay(turn_ms.millis()).await;
             alive(Task::Storage);
             since_log_ms += turn_ms;
+            since_start_ms += turn_ms;
+            if since_start_ms >= FLASH_RETRY_MS {
+                since_start_ms = 0;
+                // What it holds is read with "restore" and at the next start; what is to be saved goes there.
+                storage.start().await;
+            }
             clearing = serve(
                 storage,
                 &mut cx.shared.center,
@@ -1047,6 +1064,7 @@ mod app {
         let counters = storage.counters();
         let due = center.lock(|center| {
             center.conditions.flash_fault |= failed;
+            center.conditions.flash_missing = !storage.is_ready();
             center.conditions.log_full |= log_full;
             center.second_passed()
         });
