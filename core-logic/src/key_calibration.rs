@@ -14,7 +14,8 @@
 //! stranded; [`OnFailure::Hold`] is for those who decide otherwise.
 //!
 //! A board that starts while the key is not OFF and the high voltage is on (a reset on the road) permits at once:
-//! to withdraw the permit would open the contactors under load.
+//! to withdraw the permit would open the contactors under load. Until its first step the pin floats or is low all the
+//! same, up to 0.5 s: bridging that is the off-delay's business that docs/firmware.md demands of what the permit drives.
 
 use core::fmt;
 
