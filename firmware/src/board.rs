@@ -183,7 +183,7 @@ impl Board {
     /// ends in a watchdog reset whose stage is kept. Its pins are in their reset state meanwhile, that is they float: what
     /// keeps the board silent and its permit withheld until they are set up are the resistors of docs/firmware.md.
     pub fn start(dp: pac::Peripherals, configuration: &Configuration) -> Self {
-        let watchdog = Watchdog::start(dp.IWDG);
+        let watchdog = Watchdog::start(dp.IWDG, &dp.DBGMCU);
         let previous = retain::begin(ResetCause::take(&dp.RCC));
 
         retain::note_stage(Stage::Clock);
