@@ -741,6 +741,13 @@ impl Measurement {
         result.map(|_| ())
     }
 
+    /// What an order has found is not in the configuration: it was refused there.
+    pub fn found_was_refused(&mut self) {
+        if self.order_outcome.0 == CommandState::Done {
+            self.fail(Refusal::BeyondLimit);
+        }
+    }
+
     /// Notes the outcome of a command that others carry out (save, restore, clear log).
     pub fn note_command(&mut self, state: CommandState, reason: u16) {
         self.key_ordered = false;

@@ -450,6 +450,22 @@ fn orders_are_refused_with_their_reason_where_they_make_no_sense() {
     assert_eq!(bench.order(Order::KeyCalibration), Err(Refusal::KeyNotOff));
 }
 
+/// Found and yet not in force: the client must not read that it is done.
+#[test]
+fn a_result_that_the_configuration_refuses_is_no_success() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(1_500);
+    assert_eq!(bench.order(Order::ZeroNow), Ok(()));
+    bench.measurement.found_was_refused();
+    assert_eq!(bench.readings().command_state, CommandState::Running);
+    bench.run_ms(3_000);
+    assert_eq!(bench.readings().command_state, CommandState::Done);
+    bench.measurement.found_was_refused();
+    let readings = bench.readings();
+    let expected = (CommandState::Failed, Refusal::BeyondLimit as u16);
+    assert_eq!((readings.command_state, readings.command_reason), expected);
+}
+
 #[test]
 fn a_zero_calibration_reports_progress_ends_and_can_be_aborted() {
     let mut bench = Bench::new(Configuration::default());

@@ -684,6 +684,7 @@ mod app {
             if corrupt {
                 checked = now;
             }
+            let mut refused = found.is_some();
             let (active, crc, changed, mut damaged) =
                 cx.shared.administration.lock(|administration| {
                     let store = &mut administration.store;
@@ -693,14 +694,18 @@ mod app {
                     {
                         let mut staged = *active;
                         found.store(&mut staged);
-                        if store.commit(staged).is_err() {
-                            defmt::warn!("calibration not taken: {}", found);
-                        }
+                        refused = store.commit(staged).is_err();
                     }
                     let changed = store.generation() != generation;
                     generation = store.generation();
                     (*store.active(), store.crc(), changed, damaged)
                 });
+            if refused {
+                defmt::warn!("calibration not taken: {}", found);
+                cx.shared
+                    .center
+                    .lock(|center| center.measurement.found_was_refused());
+            }
             if changed {
                 apply(&mut cx, &active, crc);
             } else if corrupt {
