@@ -1738,8 +1738,8 @@ mod tests {
         };
         assert!(!never.is_due(0, 10));
         // A tick that comes late by a few milliseconds still sends once.
-        assert!(layout::charge::HEADER.is_due(117, 10));
-        assert!(!layout::charge::HEADER.is_due(120, 10));
+        assert!(layout::meter_current::HEADER.is_due(117, 10));
+        assert!(!layout::meter_current::HEADER.is_due(120, 10));
     }
 
     proptest! {

@@ -60,6 +60,8 @@ pub enum Contradiction {
     KeyCalibrationDelay,
     /// The slow window of the channels' comparison is not longer than the fast one.
     CompareWindows,
+    /// A storm's window or hold-off is too short for its events.
+    Storm,
     /// The open-circuit table is not usable.
     Ocv(crate::ocv::OcvTableError),
 }
@@ -276,6 +278,8 @@ impl Configuration {
             Some(Contradiction::KeyCalibrationDelay)
         } else if self.compare.fast_window_ms >= self.compare.slow_window_ms {
             Some(Contradiction::CompareWindows)
+        } else if !self.edge_storm.is_valid() || !self.meter_line_storm.is_valid() {
+            Some(Contradiction::Storm)
         } else if self.derived() != self.repeated() {
             Some(Contradiction::Derived)
         } else {
@@ -851,7 +855,7 @@ mod tests {
     #[test]
     fn each_contradiction_is_found() {
         type Change = fn(&mut Configuration);
-        let cases: [(Change, Contradiction); 7] = [
+        let cases: [(Change, Contradiction); 9] = [
             (
                 |c| c.converter.gain = crate::converter::Gain::X2,
                 Contradiction::Converter(crate::converter::ConverterConfigError::Gain),
@@ -876,6 +880,11 @@ mod tests {
             (
                 |c| c.compare.fast_window_ms = c.compare.slow_window_ms,
                 Contradiction::CompareWindows,
+            ),
+            (|c| c.edge_storm.events = 21, Contradiction::Storm),
+            (
+                |c| (c.meter_line_storm.events, c.meter_line_storm.window_us) = (100, 4_999),
+                Contradiction::Storm,
             ),
             (
                 |c| c.meter.full_scale.large = Microamps(1),

@@ -14,7 +14,8 @@
 //! stranded; [`OnFailure::Hold`] is for those who decide otherwise.
 //!
 //! A board that starts while the key is not OFF and the high voltage is on (a reset on the road) permits at once:
-//! to withdraw the permit would open the contactors under load.
+//! to withdraw the permit would open the contactors under load. Until its first step the pin floats or is low all the
+//! same, up to 0.5 s: bridging that is the off-delay's business that docs/firmware.md demands of what the permit drives.
 
 use core::fmt;
 
@@ -345,6 +346,11 @@ impl KeyCalibration {
     #[must_use]
     pub const fn factors(&self) -> KeyFactors {
         self.factors
+    }
+
+    /// Others that a client has set; they hold until some are taken.
+    pub const fn set_factors(&mut self, factors: KeyFactors) {
+        self.factors = factors;
     }
 
     /// Ends the taking of VC2 of this key cycle; whether it was under way. What follows is what follows on any failure.

@@ -264,6 +264,8 @@ pub struct Measurement {
     zero_beyond_limit: bool,
     sweep: Option<SupplyCalibration>,
     key: KeyCalibration,
+    /// The configuration's, as they were last seen: only others replace those in use.
+    key_factors_set: KeyFactors,
     key_outputs: KeyOutputs,
     soc: Soc,
     soc_reading: SocReading,
@@ -463,6 +465,7 @@ impl Measurement {
             zero_beyond_limit: false,
             sweep: None,
             key: KeyCalibration::new(factors, now),
+            key_factors_set: configuration.key_factors,
             key_outputs: KeyOutputs {
                 hv_permit: false,
                 key: KeyState::Off,
@@ -500,6 +503,10 @@ impl Measurement {
     /// owner has to be handed [`Measurement::meter_config`] as well.
     pub fn configuration_changed(&mut self, configuration: &Configuration) {
         let before = self.prepared.soc;
+        if self.key_factors_set != configuration.key_factors {
+            self.key_factors_set = configuration.key_factors;
+            self.key.set_factors(configuration.key_factors);
+        }
         let (factors, supply) = (self.key.factors(), self.prepared.supply);
         self.prepare_again(configuration, factors, supply, self.now);
         self.compare.restart_at(meter_follows(self.now));
@@ -732,6 +739,13 @@ impl Measurement {
             Err(refusal) => self.fail(refusal),
         }
         result.map(|_| ())
+    }
+
+    /// What an order has found is not in the configuration: it was refused there.
+    pub fn found_was_refused(&mut self) {
+        if self.order_outcome.0 == CommandState::Done {
+            self.fail(Refusal::BeyondLimit);
+        }
     }
 
     /// Notes the outcome of a command that others carry out (save, restore, clear log).
@@ -1043,10 +1057,9 @@ impl Measurement {
             || self.environment.supply.is_none_or(|supply| {
                 !(design::SENSOR_SUPPLY_LOW..=design::SENSOR_SUPPLY_HIGH).contains(&supply)
             });
+        let [lowest, highest] = configuration.temperature_limits;
         let too_hot_or_cold = |temperature: Option<MilliCelsius>| {
-            temperature.is_some_and(|temperature| {
-                !(design::TEMPERATURE_LOW..=design::TEMPERATURE_HIGH).contains(&temperature)
-            })
+            temperature.is_some_and(|temperature| !(lowest..=highest).contains(&temperature))
         };
         let counters = self.converter.counters();
         let implausible = self.reading.validity.contains(Validity::IMPLAUSIBLE);

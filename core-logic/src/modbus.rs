@@ -17,6 +17,7 @@
 //! | a command that the state has no use for, such as finishing a calibration that was not begun | 04 |
 //! | the active configuration failed its check | 04 |
 //! | a calibration is under way, or the flash is busy | 06 server device busy: try again |
+//! | a setting, while the configuration is being saved or restored | 06 |
 //!
 //! The standard has no code for "not in this state"; its state diagrams answer 04 wherever carrying out a valid
 //! request fails, and keep 06 for what a later repetition mends.
@@ -171,9 +172,9 @@ impl Command {
     #[must_use]
     pub const fn when(self) -> CommandRule {
         match self {
-            Self::ZeroNow | Self::StartKeyCalibration | Self::Restore | Self::FactoryDefaults => {
-                CommandRule::Idle
-            }
+            Self::ZeroNow | Self::StartKeyCalibration => CommandRule::Idle,
+            // Not before what is to be saved is in the flash, and not in the place of another order to it.
+            Self::Restore | Self::FactoryDefaults => CommandRule::IdleFlashFree,
             Self::SupplyPointAtZero | Self::SupplyPointAtCurrent => CommandRule::SupplySweep,
             Self::FinishSupplyCalibration => CommandRule::SupplySweepBegun,
             Self::Save => CommandRule::FlashFree,
@@ -190,6 +191,8 @@ pub enum CommandRule {
     Always,
     /// High voltage off, no calibration under way.
     Idle,
+    /// High voltage off, no calibration under way, flash not busy.
+    IdleFlashFree,
     /// High voltage off, no calibration but the supply sweep under way.
     SupplySweep,
     /// High voltage off, the supply sweep under way.
@@ -207,6 +210,7 @@ impl CommandRule {
         match self {
             Self::Always => "always",
             Self::Idle => "high voltage off, no calibration under way",
+            Self::IdleFlashFree => "high voltage off, no calibration under way, flash not busy",
             Self::SupplySweep => "high voltage off, no other calibration under way",
             Self::SupplySweepBegun => "high voltage off, supply calibration under way",
             Self::FlashFree => "flash not busy",
@@ -226,6 +230,10 @@ impl CommandRule {
         match self {
             Self::Always => Ok(()),
             Self::Idle => When::Standstill.check(readings),
+            Self::IdleFlashFree => {
+                When::Standstill.check(readings)?;
+                flash_free()
+            }
             Self::SupplySweep => {
                 quiet()?;
                 match readings.activity {
@@ -450,6 +458,10 @@ fn write(
     for_each(FIELDS, address, quantity, &mut |field: &Field, _| {
         field.when.check(readings)
     })?;
+    // What is saved is what was in force at the order, and what is restored is not changed before it is there.
+    if readings.configuration_in_transfer {
+        return Err(Exception::ServerDeviceBusy);
+    }
     let mut words = values
         .iter()
         .zip(values.iter().skip(1))
@@ -970,6 +982,20 @@ mod tests {
     }
 
     #[test]
+    fn settings_wait_for_a_save_and_not_for_the_log() {
+        let mut board = Board::new();
+        board.readings.storage_busy = true;
+        assert_eq!(board.write_one(ADDRESS, 3), changed());
+        board.readings.configuration_in_transfer = true;
+        assert_eq!(board.write_one(ADDRESS, 4), Err(6));
+        assert_eq!(board.write_one(ADDRESS + 2, 4), Err(2));
+        assert_eq!(board.store.active().rtu.address, 3);
+        assert_eq!(board.read(3, ADDRESS, 1), Ok([3].to_vec()));
+        // An order that the flash has no part in.
+        assert!(board.write_one(COMMAND_ADDRESS, 0x5A06).is_ok());
+    }
+
+    #[test]
     fn a_corrupted_configuration_takes_no_change() {
         let mut board = Board::new();
         board.store.corrupt();
@@ -1068,9 +1094,12 @@ mod tests {
             (C::Restore, quiet, 0),
             (C::Restore, (true, A::None, false), 4),
             (C::Restore, (false, A::KeyCalibration, false), 6),
+            (C::Restore, (false, A::None, true), 6),
+            (C::Restore, (true, A::None, true), 4),
             (C::FactoryDefaults, quiet, 0),
             (C::FactoryDefaults, (true, A::None, false), 4),
             (C::FactoryDefaults, (false, A::SupplyCalibration, false), 6),
+            (C::FactoryDefaults, (false, A::None, true), 6),
             (C::ClearLog, quiet, 0),
             (C::ClearLog, (true, A::None, false), 4),
             (C::ClearLog, (true, A::None, true), 4),
@@ -1107,6 +1136,10 @@ mod tests {
         assert_eq!(
             board_text(C::FinishSupplyCalibration),
             "high voltage off, supply calibration under way"
+        );
+        assert_eq!(
+            board_text(C::Restore),
+            "high voltage off, no calibration under way, flash not busy"
         );
         assert_eq!(board_text(C::Save), "flash not busy");
         assert_eq!(board_text(C::ClearLog), "high voltage off, flash not busy");

@@ -449,7 +449,7 @@ pub struct FlagReport {
 ///   produces as well. Not decidable from one level.
 ///
 /// With the small sensor's own level beside it all of these are decided, except near 0 A, where small and large
-/// hypothesis lie closer together than the tolerance, and where a wrong scale costs least.
+/// hypothesis lie closer together than the margins, and where a wrong scale costs least: below 9 A.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct FlagPlausibility {
@@ -527,15 +527,19 @@ fn passed_sensor(config: &FlagPlausibilityConfig, seen: &FlagObservation) -> Opt
     // Once the small sensor saturates, every level of the large one beyond that fits.
     let saturated = config.small_full_scale.saturating_sub(tolerance);
     let beyond = |reading: Microamps| reading.saturating_abs() >= saturated;
-    let as_small = own.saturating_sub(seen.passed_as_small).saturating_abs() <= tolerance;
-    let as_large = own.saturating_sub(seen.passed_as_large).saturating_abs()
-        <= config.margin_below.saturating_abs()
+    let below = config.margin_below.saturating_abs();
+    let off = |reading: Microamps| own.saturating_sub(reading).saturating_abs();
+    let as_small = off(seen.passed_as_small) <= tolerance;
+    // The own level, through the network, may be off by more than the tolerance: at rest it then misses both by the
+    // same, which only the wider margin of the large one lets pass. That proves nothing against the small one.
+    let not_small = off(seen.passed_as_small) > tolerance.max(below);
+    let as_large = off(seen.passed_as_large) <= below
         || (beyond(own)
             && beyond(seen.passed_as_large)
             && (own.get() < 0) == (seen.passed_as_large.get() < 0));
     match (as_small, as_large) {
         (true, false) => Some(Range::Small),
-        (false, true) => Some(Range::Large),
+        (false, true) if not_small => Some(Range::Large),
         _ => None,
     }
 }
@@ -926,6 +930,10 @@ mod tests {
         let zero = verdict(Range::Small, 0.5, Some(0.6));
         assert_eq!(zero.passed, None);
         assert!(!zero.implausible);
+        // 9 A of the large sensor are told from 0.9 A of the small one.
+        let large = verdict(Range::Small, 0.9, Some(9.0));
+        assert_eq!(large.passed, Some(Range::Large));
+        assert!(large.implausible);
         // Not saturated: the level of the large sensor is compared itself. 55 A and 580 A are not the same.
         assert_eq!(
             verdict(Range::Small, 55.0, Some(55.0)).passed,
@@ -936,6 +944,19 @@ mod tests {
             Some(Range::Large)
         );
         assert_eq!(verdict(Range::Large, 4.6, Some(55.0)).passed, None);
+    }
+
+    /// 8 A are 67 mV at the pin: an offset of the network's channel, and no matter of the switch.
+    #[test]
+    fn an_own_level_that_is_off_does_not_contradict_a_small_current() {
+        for sign in [1.0, -1.0] {
+            for off in (-79..=79).map(|tenth| f64::from(tenth) * 0.1) {
+                for current in (0..=200).map(|tenth| f64::from(tenth) * 0.1 * sign) {
+                    let report = verdict(Range::Small, current, Some(current + off));
+                    assert!(!report.implausible, "{current} A, off by {off} A");
+                }
+            }
+        }
     }
 
     #[test]

@@ -38,6 +38,19 @@ impl StormConfig {
     };
 }
 
+impl StormConfig {
+    /// Shortest window and shortest rest for each event: 20 in a millisecond. More of them would be served at the cost of
+    /// all else that the processor has to do, the watchdog included.
+    const MIN_US_PER_EVENT: u32 = 50;
+
+    /// Whether no line can take more than its share of the time.
+    #[must_use]
+    pub fn is_valid(&self) -> bool {
+        let shortest = u32::from(self.events).saturating_mul(Self::MIN_US_PER_EVENT);
+        self.window_us.min(self.hold_off_us) >= shortest
+    }
+}
+
 impl Default for StormConfig {
     fn default() -> Self {
         Self::METER_LINE
@@ -185,6 +198,21 @@ mod tests {
         assert_eq!(guard.on_event(&CONFIG, at(100)), StormAction::Pass);
         assert_eq!(guard.on_event(&CONFIG, at(101)), StormAction::Pass);
         assert_eq!(guard.on_event(&CONFIG, at(102)), StormAction::Mask);
+    }
+
+    #[test]
+    fn twenty_events_a_millisecond_are_the_most() {
+        assert!(StormConfig::RANGE_EDGE.is_valid() && StormConfig::METER_LINE.is_valid());
+        let config = |events, window_us| StormConfig {
+            events,
+            window_us,
+            hold_off_us: 5_000,
+        };
+        assert!(config(100, 5_000).is_valid() && config(10, 500).is_valid());
+        assert!(!config(100, 4_999).is_valid() && !config(11, 500).is_valid());
+        assert!(!config(u16::MAX, 10).is_valid());
+        let long_window = config(101, 1_000_000);
+        assert!(!long_window.is_valid());
     }
 
     #[test]

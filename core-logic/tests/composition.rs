@@ -25,6 +25,7 @@ use core_logic::modbus::readings::CommandState;
 use core_logic::modbus::{Activity, Readings};
 use core_logic::open_sensor::{network_output, network_output_open};
 use core_logic::range::{Range, RangeHistory};
+use core_logic::retained::RetainedState;
 use core_logic::units::{
     Duration, Instant, Microamps, Microvolts, MilliCelsius, Millivolts, Nanocoulombs, Ppm,
 };
@@ -447,6 +448,22 @@ fn orders_are_refused_with_their_reason_where_they_make_no_sense() {
             .contains(Validity::CALIBRATING)
     );
     assert_eq!(bench.order(Order::KeyCalibration), Err(Refusal::KeyNotOff));
+}
+
+/// Found and yet not in force: the client must not read that it is done.
+#[test]
+fn a_result_that_the_configuration_refuses_is_no_success() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(1_500);
+    assert_eq!(bench.order(Order::ZeroNow), Ok(()));
+    bench.measurement.found_was_refused();
+    assert_eq!(bench.readings().command_state, CommandState::Running);
+    bench.run_ms(3_000);
+    assert_eq!(bench.readings().command_state, CommandState::Done);
+    bench.measurement.found_was_refused();
+    let readings = bench.readings();
+    let expected = (CommandState::Failed, Refusal::BeyondLimit as u16);
+    assert_eq!((readings.command_state, readings.command_reason), expected);
 }
 
 #[test]
@@ -886,6 +903,76 @@ fn surroundings_are_sent_with_their_validity() {
     bench.environment.supply = Some(Microvolts::from_millivolts(4_600));
     bench.run_ms(10);
     assert_eq!(bench.measurement.environment().supply, Millivolts(4_600));
+}
+
+#[test]
+fn temperature_limits_are_those_of_the_configuration() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(1_500);
+    assert!(!bench.has(Code::TemperatureOutOfRange));
+    // The sensors' 25 °C and the board's 30 °C.
+    for limits in [[-40_000, 29_999], [25_001, 105_000]] {
+        bench.configuration.temperature_limits = limits.map(MilliCelsius);
+        bench.run_ms(1_500);
+        assert!(bench.has(Code::TemperatureOutOfRange), "{limits:?}");
+        bench.configuration.temperature_limits = [25_000, 30_000].map(MilliCelsius);
+        bench.run_ms(6_000);
+        assert!(!bench.has(Code::TemperatureOutOfRange), "{limits:?}");
+    }
+}
+
+/// What a client sets, restores or takes from the factory replaces what was retained or taken; nothing else does.
+#[test]
+fn key_factors_of_the_configuration_are_used_when_they_change() {
+    let mut bench = Bench::new(Configuration::default());
+    let factors = |k_ppb, a| KeyFactors {
+        k_ppb,
+        a: Microvolts(a),
+    };
+    let retained = RetainedState {
+        key_factors: factors(1_001_000_000, 1_000),
+        ..bench.measurement.retained(0)
+    };
+    let start = Instant::from_ticks(0);
+    bench.measurement = Measurement::new(
+        &bench.configuration,
+        Some(&retained),
+        Nanocoulombs::ZERO,
+        start,
+    );
+    let used = |bench: &Bench| bench.measurement.retained(0).key_factors;
+    assert_eq!(used(&bench), retained.key_factors);
+    // Another setting leaves them.
+    bench.configuration.soc.capacity_mah += 1;
+    bench
+        .measurement
+        .configuration_changed(&bench.configuration);
+    assert_eq!(used(&bench), retained.key_factors);
+    bench.run_ms(500);
+    let current = |bench: &Bench| bench.measurement.current().current.get();
+    // 2.5 V · 0.1 % and 1 mV, at 37.5 mV/A; one code is 16.3 mA.
+    assert!(
+        (current(&bench) - 93_360).abs() < 16_300,
+        "{}",
+        current(&bench)
+    );
+    bench.configuration.key_factors = factors(1_000_000_000, -10_000);
+    bench
+        .measurement
+        .configuration_changed(&bench.configuration);
+    assert_eq!(used(&bench), bench.configuration.key_factors);
+    bench.run_ms(500);
+    assert!(
+        (current(&bench) + 266_667).abs() < 16_300,
+        "{}",
+        current(&bench)
+    );
+    let set = effective_meter_config(
+        &bench.configuration,
+        bench.configuration.key_factors,
+        bench.environment.supply,
+    );
+    assert_eq!(bench.measurement.meter_config(&bench.configuration), set);
 }
 
 /// The meter's factors follow configuration and supply, and its mean with them; the codes rightly stay.

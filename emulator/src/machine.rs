@@ -24,6 +24,8 @@ use crate::time::Ticks;
 
 /// Where the peripherals' addresses begin and how long the range is that the MCU decodes (RM0090, memory map).
 const PERIPHERALS: (u64, u64) = (0x4000_0000, 0x0008_0000);
+/// DBGMCU, its four registers. Nobody debugs: they keep what is written, and it has no effect.
+const DEBUG: (u64, u64) = (0xE004_2000, 16);
 /// Factory values and unique ID.
 const SYSTEM_MEMORY: u64 = 0x1FFF_7A00;
 /// The longest time that a polling loop is let turn at once.
@@ -200,6 +202,10 @@ impl<'table> Machine<'table> {
             map.map(
                 Region::io("peripherals", PERIPHERALS.1, Arc::<SystemBus>::clone(&bus)),
                 PERIPHERALS.0,
+            )?;
+            map.map(
+                Region::ram("dbgmcu", Arc::new(RamStore::new(DEBUG.1))),
+                DEBUG.0,
             )?;
         }
         debug_assert_eq!(image.flash.len(), FLASH_LENGTH as usize);

@@ -4,11 +4,12 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
-use core_logic::can::layout::{MESSAGES, Message};
+use core_logic::can::layout::{Direction, MESSAGES, Message};
 use emulator::can_frame::CanFrame;
 use emulator::faults::Fault;
+use emulator::mcu::rcc::ResetCause;
 use emulator::rig::{Firmware, Rig, Setup};
-use emulator::scenario::{Contactors, Row, Scenario};
+use emulator::scenario::{Contactors, Key, Row, Scenario};
 use emulator::time::Ticks;
 
 fn firmware() -> Firmware {
@@ -69,6 +70,37 @@ fn current_frames_keep_their_period_under_load() {
     assert!(!rig.take_rs485().is_empty());
 }
 
+/// `GenMsgStartDelayTime` of can/board.dbc, which is compared with these headers: counted from the first `Current`.
+#[test]
+fn each_message_first_goes_out_when_the_dbc_says() {
+    let firmware = firmware();
+    let mut rig = Rig::new(&firmware, driving(10.0)).unwrap();
+    let mut first_ms = [None; MESSAGES.len()];
+    for ms in 0..1_500_u32 {
+        rig.run_s(0.001).unwrap();
+        for (message, first_ms) in MESSAGES.iter().zip(&mut first_ms) {
+            if rig.view.period(message.name).frames > 0 {
+                first_ms.get_or_insert(ms);
+            }
+        }
+    }
+    let begin_ms = first_ms[0].unwrap();
+    assert_eq!(MESSAGES[0].name, "Current");
+    for (message, first_ms) in MESSAGES.iter().zip(first_ms) {
+        if message.header.direction == Direction::Received {
+            continue;
+        }
+        // Up to four frames of 0.25 ms in one tick, and the look every millisecond.
+        let delay_ms = first_ms.unwrap() - begin_ms;
+        let expected_ms = u32::from(message.header.phase_ms);
+        assert!(
+            (expected_ms..=expected_ms + 2).contains(&delay_ms),
+            "{}: {delay_ms} ms",
+            message.name
+        );
+    }
+}
+
 /// A frame is given up after 20 ms on a bus that others fill. Some are on the bus in just that moment, and go out.
 #[test]
 fn every_frame_that_goes_out_is_counted_once() {
@@ -91,6 +123,105 @@ fn every_frame_that_goes_out_is_counted_once() {
     let after = on_the_bus(&rig);
     let sent = u64::from(u32::from_be_bytes(answer[3..7].try_into().unwrap()));
     assert!((before..=after).contains(&sent), "{before} {sent} {after}");
+}
+
+/// Holding registers as words.
+fn settings(rig: &mut Rig<'_>, address: u16, count: u16) -> Vec<u16> {
+    let ([a, b], [c, d]) = (address.to_be_bytes(), count.to_be_bytes());
+    let answer = rig.modbus(&[1, 3, a, b, c, d]).unwrap();
+    assert_eq!(answer[..2], [1, 3], "{answer:02X?}");
+    answer[3..]
+        .chunks(2)
+        .map(|word| u16::from_be_bytes([word[0], word[1]]))
+        .collect()
+}
+
+/// Writes holding registers; the exception code if the board refuses.
+fn set(rig: &mut Rig<'_>, address: u16, words: &[u16]) -> Result<(), u8> {
+    let ([a, b], [c, d]) = (address.to_be_bytes(), (words.len() as u16).to_be_bytes());
+    let mut request = vec![1, 0x10, a, b, c, d, 2 * words.len() as u8];
+    request.extend(words.iter().flat_map(|word| word.to_be_bytes()));
+    let answer = rig.modbus(&request).unwrap();
+    if answer[1] & 0x80 != 0 {
+        return Err(answer[2]);
+    }
+    Ok(())
+}
+
+fn words_of(value: i32) -> [u16; 2] {
+    [(value >> 16) as u16, value as u16]
+}
+
+/// Count and points contradict each other when they come one after the other: one request carries both.
+#[test]
+fn a_client_sets_an_open_circuit_table_of_any_length() {
+    const COUNT: u16 = 0x0781;
+    let firmware = firmware();
+    let mut rig = Rig::new(&firmware, driving(0.0)).unwrap();
+    rig.run_s(0.5).unwrap();
+    assert_eq!(settings(&mut rig, COUNT, 1), [11]);
+    for points in [21, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11] {
+        let soc = |n: i32| match n {
+            n if n < points => n * 1_000_000 / (points - 1),
+            _ => 0,
+        };
+        let voltage = |n: i32| match n {
+            n if n < points => 3_000_000 + n * 1_200_000 / (points - 1),
+            _ => 0,
+        };
+        let mut words = vec![points as u16];
+        words.extend((0..21).flat_map(|n| words_of(soc(n))));
+        words.extend((0..21).flat_map(|n| words_of(voltage(n))));
+        assert_eq!(set(&mut rig, COUNT, &words), Ok(()), "{points} points");
+        assert_eq!(settings(&mut rig, COUNT, 85), words, "{points} points");
+    }
+    // The count alone would leave a table that does not end at full charge.
+    assert_eq!(set(&mut rig, COUNT, &[10]), Err(3));
+}
+
+/// A factor of 2 % in place of none; what is taken by key state later still replaces it.
+#[test]
+fn key_factors_that_a_client_sets_are_used() {
+    let firmware = firmware();
+    let mut parked = Row::at_rest(0.0).with_key(Key::Off);
+    // A sensor that reads 10.7 A.
+    parked.output_shift_v = 0.4;
+    let scenario = Scenario::steady(parked, Contactors::Permitted);
+    let mut rig = Rig::new(&firmware, Setup::nominal(scenario)).unwrap();
+    rig.run_s(1.5).unwrap();
+    let before_a = rig.view.current_a().value.unwrap();
+    assert_eq!(set(&mut rig, 0x0420, &words_of(1_020_000_000)), Ok(()));
+    rig.run_s(0.5).unwrap();
+    let after_a = rig.view.current_a().value.unwrap();
+    // 2 % of 2.9 V, at 37.5 mV/A.
+    let moved_a = after_a - before_a;
+    assert!((moved_a - 1.547).abs() < 0.05, "{before_a} {after_a}");
+    // They outlive a reset, and are what a client reads.
+    rig.machine.reset(ResetCause::Software);
+    rig.view = Default::default();
+    rig.run_s(1.0).unwrap();
+    let reset_a = rig.view.current_a().value.unwrap();
+    assert!((reset_a - after_a).abs() < 0.05, "{after_a} {reset_a}");
+    assert_eq!(settings(&mut rig, 0x0420, 2), words_of(1_020_000_000));
+    assert_eq!(set(&mut rig, 0x0420, &words_of(1_000_000_000)), Ok(()));
+    rig.run_s(0.5).unwrap();
+    let back_a = rig.view.current_a().value.unwrap();
+    assert!((back_a - before_a).abs() < 0.05, "{before_a} {back_a}");
+}
+
+/// 25 °C is too warm when the limit is 10 °C.
+#[test]
+fn temperature_limits_that_a_client_sets_are_used() {
+    let firmware = firmware();
+    let mut rig = Rig::new(&firmware, driving(0.0)).unwrap();
+    rig.run_s(1.0).unwrap();
+    assert!(!rig.view.diagnoses.contains_key("TemperatureOutOfRange"));
+    let mut words = words_of(-55_000).to_vec();
+    words.extend(words_of(10_000));
+    assert_eq!(set(&mut rig, 0x0808, &words), Ok(()));
+    rig.run_s(3.0).unwrap();
+    let active = rig.view.active_diagnoses();
+    assert!(active.contains(&"TemperatureOutOfRange"), "{active:?}");
 }
 
 /// Writes and reads in turn, each read at another time after its write, while the meter's owner takes the changed

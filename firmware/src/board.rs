@@ -180,10 +180,10 @@ impl Board {
     /// Starts the hardware, with interrupts disabled.
     ///
     /// The watchdog is first: crystal and PLL are waited for without a bound, and a crystal that does not swing then
-    /// ends in a watchdog reset whose stage is kept. The board stays silent and withholds its permit, as it must
-    /// without a time base; its pins are in their reset state meanwhile.
+    /// ends in a watchdog reset whose stage is kept. Its pins are in their reset state meanwhile, that is they float: what
+    /// keeps the board silent and its permit withheld until they are set up are the resistors of docs/firmware.md.
     pub fn start(dp: pac::Peripherals, configuration: &Configuration) -> Self {
-        let watchdog = Watchdog::start(dp.IWDG);
+        let watchdog = Watchdog::start(dp.IWDG, &dp.DBGMCU);
         let previous = retain::begin(ResetCause::take(&dp.RCC));
 
         retain::note_stage(Stage::Clock);
@@ -197,14 +197,15 @@ impl Board {
         let c = dp.GPIOC.split(&mut rcc);
         let (mut exti, mut syscfg) = (dp.EXTI, dp.SYSCFG.constrain(&mut rcc));
 
-        // The pin table; docs/firmware.md shows it with the outside's names.
-        let mut range_flag = /*  PA0  */ a.pa0.into_pull_down_input();
+        // The pin table; docs/firmware.md shows it with the outside's names. PA0 and PA6 may see 5 V, which their pads
+        // stand only with the internal pulls off.
+        let mut range_flag = /*  PA0  */ a.pa0.into_floating_input();
         let rs485_driver = /*    PA1  */ a.pa1.into_push_pull_output_in_state(PinState::Low);
         let _rs485_tx = /*       PA2  */ a.pa2.into_alternate::<7>();
         let _rs485_rx = /*       PA3  */ a.pa3.into_alternate::<7>().internal_pull_up(true);
         let meter_select = /*    PA4  */ a.pa4.into_push_pull_output_in_state(PinState::High);
         let _meter_clock = /*    PA5  */ a.pa5.into_alternate::<5>();
-        let _meter_miso = /*     PA6  */ a.pa6.into_alternate::<5>().internal_pull_up(true);
+        let _meter_miso = /*     PA6  */ a.pa6.into_alternate::<5>();
         let _meter_mosi = /*     PA7  */ a.pa7.into_alternate::<5>();
         let _can_rx = /*         PA11 */ a.pa11.into_alternate::<9>().internal_pull_up(true);
         let _can_tx = /*         PA12 */ a.pa12.into_alternate::<9>();

@@ -53,6 +53,8 @@ pub struct Conditions {
     pub rs485_errors: bool,
     /// Set by the storage task.
     pub flash_fault: bool,
+    /// The same, as long as the chip does not answer.
+    pub flash_missing: bool,
     /// Set by the storage task.
     pub log_full: bool,
     /// Set by the supervision.
@@ -297,7 +299,7 @@ impl Center {
             ),
             (
                 Code::FlashFault,
-                core::mem::take(&mut self.conditions.flash_fault),
+                core::mem::take(&mut self.conditions.flash_fault) | self.conditions.flash_missing,
             ),
             (
                 Code::LogFull,
@@ -314,7 +316,8 @@ impl Center {
         set
     }
 
-    /// The frames of this tick; those of 100 ms are spread so that no tick has more than four.
+    /// The frames of this tick; those of 100 ms are spread so that no tick has more than four. When each comes first
+    /// is in can/board.dbc.
     fn send(&mut self, now: Instant) {
         let current = self.sender.current(&self.measurement.current());
         self.bus.send(current, now);

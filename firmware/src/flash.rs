@@ -97,12 +97,15 @@ impl<SPI: SpiDevice> Flash<SPI> {
         Self(spi)
     }
 
-    /// Wakes the chip and makes sure that it is the one expected.
+    /// Wakes the chip and makes sure that it is the one expected: one try of 1 ms, which fails as well while an erase
+    /// runs that a reset of the MCU cut off from us.
     pub async fn start(&mut self) -> Result<(), Error<SPI::Error>> {
         self.0.write(&[RELEASE_POWER_DOWN]).map_err(Error::Bus)?;
-        // 3 µs until it listens; and an erase that a reset of the MCU cut off from us may still run.
+        // 3 µs until it listens.
         Mono::delay(1.millis()).await;
-        self.wait(ERASE_LIMIT_MS).await?;
+        if self.status()? & STATUS_BUSY != 0 {
+            return Err(Error::Timeout);
+        }
         let mut identity = [0; 3];
         self.transfer(&[READ_IDENTITY], &mut identity)?;
         match identity {

@@ -124,6 +124,8 @@ mod app {
     const TICK_MS: u32 = 10;
     /// Idle looks for late tasks at most this often.
     const IDLE_LOOK_US: u32 = 10_000;
+    /// Time between two tries to wake a flash that has not answered.
+    const FLASH_RETRY_MS: u32 = 1_000;
     /// Time between two log records when nothing happens.
     const LOG_PERIOD_MS: u32 = 10_000;
     /// Stack that has to stay free.
@@ -647,6 +649,10 @@ mod app {
                     readings.configuration_saved =
                         administration.saved == Some(administration.store.generation());
                     readings.storage_busy = administration.request.is_some();
+                    readings.configuration_in_transfer = matches!(
+                        administration.request,
+                        Some(Command::Save | Command::Restore)
+                    );
                     readings.flash_counters = administration.flash_counters;
                     server.serve(now, &readings, &mut administration.store)
                 });
@@ -678,6 +684,7 @@ mod app {
             if corrupt {
                 checked = now;
             }
+            let mut refused = found.is_some();
             let (active, crc, changed, mut damaged) =
                 cx.shared.administration.lock(|administration| {
                     let store = &mut administration.store;
@@ -687,14 +694,18 @@ mod app {
                     {
                         let mut staged = *active;
                         found.store(&mut staged);
-                        if store.commit(staged).is_err() {
-                            defmt::warn!("calibration not taken: {}", found);
-                        }
+                        refused = store.commit(staged).is_err();
                     }
                     let changed = store.generation() != generation;
                     generation = store.generation();
                     (*store.active(), store.crc(), changed, damaged)
                 });
+            if refused {
+                defmt::warn!("calibration not taken: {}", found);
+                cx.shared
+                    .center
+                    .lock(|center| center.measurement.found_was_refused());
+            }
             if changed {
                 apply(&mut cx, &active, crc);
             } else if corrupt {
@@ -820,12 +831,19 @@ mod app {
         let storage = cx.local.storage;
         let (mut stored, mut state) = (Stored::Refused, Stored::Refused);
         let load = async {
-            storage.start().await;
+            // A chip that answers late or wrongly once, or still erases, must not cost the calibration.
+            while !storage.start().await {
+                alive(Task::Storage);
+                Mono::delay(1.millis()).await;
+            }
             stored = storage.configuration().await;
             state = storage.state().await;
         };
         // What has not come in time counts as refused.
         let _ = Mono::timeout_after(LOAD_LIMIT_MS.millis(), load).await;
+        if !storage.is_ready() {
+            defmt::error!("flash not ready");
+        }
         let now = time::now();
 
         let configuration = cx.shared.administration.lock(|administration| {
@@ -840,10 +858,23 @@ mod app {
         // The next start must not find nothing, nor what is older than this one's.
         let mut first_save = !start.is_in_flash;
         let charge = start.state.map(|state| state.charge_total);
+        let configuration = cx.shared.administration.lock(|administration| {
+            let store = &mut administration.store;
+            // The settings show the factors in use, or a client could not set those that they show.
+            if let Some(state) = &start.state
+                && state.key_factors != store.active().key_factors
+            {
+                let mut staged = *store.active();
+                staged.key_factors = state.key_factors;
+                let _ = store.commit(staged);
+            }
+            *store.active()
+        });
         let crc = configuration.crc();
         let calibration = cx.shared.center.lock(|center| {
             center.identity.configuration_crc = crc;
             center.conditions.flash_fault |= start.is_refused;
+            center.conditions.flash_missing = !storage.is_ready();
             if matches!(stored, Stored::Refused) {
                 center
                     .conditions
@@ -869,12 +900,19 @@ mod app {
 
         let mut policy = SavePolicy::new(now, charge.unwrap_or(Nanocoulombs::ZERO));
         let mut since_log_ms = 0;
+        let mut since_start_ms = 0;
         let mut clearing = false;
         loop {
             let turn_ms = if clearing { 10 } else { 100 };
             Mono::delay(turn_ms.millis()).await;
             alive(Task::Storage);
             since_log_ms += turn_ms;
+            since_start_ms += turn_ms;
+            if since_start_ms >= FLASH_RETRY_MS {
+                since_start_ms = 0;
+                // What it holds is read with "restore" and at the next start; what is to be saved goes there.
+                storage.start().await;
+            }
             clearing = serve(
                 storage,
                 &mut cx.shared.center,
@@ -974,7 +1012,8 @@ mod app {
         center: &mut impl rtic::Mutex<T = Center>,
         administration: &mut impl rtic::Mutex<T = Administration>,
     ) -> bool {
-        let done = match administration.lock(|administration| administration.request) {
+        let request = administration.lock(|administration| administration.request);
+        let done = match request {
             None => return false,
             Some(Command::Save) => {
                 let (configuration, generation) = administration.lock(|administration| {
@@ -1011,7 +1050,12 @@ mod app {
             CommandState::Failed
         };
         center.lock(|center| center.measurement.note_command(state, 0));
-        administration.lock(|administration| administration.request = None);
+        administration.lock(|administration| {
+            // An order that has come meanwhile is still to be served.
+            if administration.request == request {
+                administration.request = None;
+            }
+        });
         false
     }
 
@@ -1025,6 +1069,7 @@ mod app {
         let counters = storage.counters();
         let due = center.lock(|center| {
             center.conditions.flash_fault |= failed;
+            center.conditions.flash_missing = !storage.is_ready();
             center.conditions.log_full |= log_full;
             center.second_passed()
         });

@@ -56,7 +56,8 @@ fn set(index: usize, value: u32) {
     }
 }
 
-/// Why the core started, as RCC tells; several may hold at once. The bits are those of the Modbus map.
+/// Why the core started, as RCC tells; several may hold at once. The bits are those of the Modbus
+/// map, which shows only the weightiest of them (`identity`).
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct ResetCause(u16);
 

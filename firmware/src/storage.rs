@@ -124,15 +124,20 @@ impl Storage {
         )
     }
 
-    /// Wakes the chip. Without it nothing is read or written.
-    pub async fn start(&mut self) {
-        match self.flash.start().await {
-            Ok(()) => self.ready = true,
-            Err(error) => {
-                defmt::error!("flash: {}", error);
-                self.failed = true;
+    /// One try to wake the chip, if it is not awake; whether it is. Without it nothing is read or written.
+    pub async fn start(&mut self) -> bool {
+        if !self.ready {
+            match self.flash.start().await {
+                Ok(()) => self.ready = true,
+                Err(error) => defmt::debug!("flash: {}", error),
             }
         }
+        self.ready
+    }
+
+    /// Whether the chip has answered.
+    pub const fn is_ready(&self) -> bool {
+        self.ready
     }
 
     /// The stored configuration.

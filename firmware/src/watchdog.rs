@@ -1,7 +1,7 @@
 //! The independent watchdog. It runs from its own oscillator (LSI, 17 … 47 kHz), so it also ends a start-up that waits
-//! for a crystal that does not swing; and it can never be stopped again.
+//! for a crystal that does not swing; and it can never be stopped again, but by a debugger that halts the core.
 
-use stm32f4xx_hal::pac::IWDG;
+use stm32f4xx_hal::pac::{DBGMCU, IWDG};
 
 /// 0.68 … 1.88 s over the tolerance of LSI, 1.0 s nominal.
 const RELOAD: u16 = 1_000 - 1;
@@ -15,7 +15,9 @@ pub struct Watchdog(IWDG);
 impl Watchdog {
     /// Starts it, and waits until prescaler and reload value have reached its clock domain, five periods of LSI: a feed
     /// before that would load the reset's 4 s. The wait ends after 10 ms at the latest; the watchdog runs either way.
-    pub fn start(iwdg: IWDG) -> Self {
+    pub fn start(iwdg: IWDG, debug: &DBGMCU) -> Self {
+        // A breakpoint is not to end in a reset.
+        debug.apb1_fz().modify(|_, w| w.dbg_iwdg_stop().set_bit());
         iwdg.kr().write(|w| w.key().start());
         iwdg.kr().write(|w| w.key().unlock());
         // LSI / 32: 1 ms at the nominal 32 kHz.

@@ -240,7 +240,7 @@ messages! {
         SPAN "CurrentAverageSpan" = unsigned 52 | 12, 0 ..= 4_095, 2 / 1;
     }
     /// Net charge.
-    charge "Charge" = 0x110, Transmitted, 100 ms + 10 ms, data id 0x110 {
+    charge "Charge" = 0x110, Transmitted, 100 ms + 0 ms, data id 0x110 {
         CRC "ChargeCrc" = unsigned 0 | 8, 0 ..= 255, 1 / 1;
         COUNTER "ChargeCounter" = unsigned 8 | 4, 0 ..= 14, 1 / 1;
         ID_NIBBLE "ChargeIdNibble" = unsigned 12 | 4, 0 ..= 15, 1 / 1;
@@ -249,7 +249,7 @@ messages! {
         ESTIMATED "ChargeEstimated" = unsigned 63 | 1, 0 ..= 1, 1 / 1;
     }
     /// Mean current by the meter.
-    meter_current "MeterCurrent" = 0x111, Transmitted, 100 ms + 20 ms, data id 0x111 {
+    meter_current "MeterCurrent" = 0x111, Transmitted, 100 ms + 10 ms, data id 0x111 {
         CRC "MeterCurrentCrc" = unsigned 0 | 8, 0 ..= 255, 1 / 1;
         COUNTER "MeterCurrentCounter" = unsigned 8 | 4, 0 ..= 14, 1 / 1;
         ID_NIBBLE "MeterCurrentIdNibble" = unsigned 12 | 4, 0 ..= 15, 1 / 1;
@@ -259,7 +259,7 @@ messages! {
         UNCERTAINTY "ChargeUncertainty" = unsigned 46 | 18, 0 ..= 262_142, not available 262_143, 1 / 100;
     }
     /// State of charge.
-    state_of_charge "StateOfCharge" = 0x112, Transmitted, 100 ms + 30 ms, data id 0x112 {
+    state_of_charge "StateOfCharge" = 0x112, Transmitted, 100 ms + 20 ms, data id 0x112 {
         CRC "StateOfChargeCrc" = unsigned 0 | 8, 0 ..= 255, 1 / 1;
         COUNTER "StateOfChargeCounter" = unsigned 8 | 4, 0 ..= 14, 1 / 1;
         ID_NIBBLE "StateOfChargeIdNibble" = unsigned 12 | 4, 0 ..= 15, 1 / 1;
@@ -269,12 +269,12 @@ messages! {
         REMAINING "RemainingCharge" = unsigned 48 | 16, 0 ..= 65_534, not available 65_535, 1 / 10;
     }
     /// Charge throughput.
-    throughput "Throughput" = 0x121, Transmitted, 1000 ms + 50 ms {
+    throughput "Throughput" = 0x121, Transmitted, 1000 ms + 90 ms {
         DISCHARGED "ChargeDischarged" = unsigned 0 | 32, 0 ..= 4_294_967_295, 1 / 1;
         CHARGED "ChargeCharged" = unsigned 32 | 32, 0 ..= 4_294_967_295, 1 / 1;
     }
     /// Supply and temperatures.
-    environment "Environment" = 0x130, Transmitted, 100 ms + 40 ms {
+    environment "Environment" = 0x130, Transmitted, 100 ms + 30 ms {
         SUPPLY "SensorSupply" = unsigned 0 | 14, 0 ..= 16_382, not available 16_383, 1 / 1;
         SUPPLY_VALIDITY "SensorSupplyValidity" = unsigned 16 | 8, 0 ..= 255, 1 / 1;
         SENSOR_TEMPERATURE "SensorTemperature" = signed 24 | 12, -2_047 ..= 2_047, not available -2_048, 1 / 10;
@@ -283,7 +283,7 @@ messages! {
         BOARD_TEMPERATURE_VALIDITY "BoardTemperatureValidity" = unsigned 56 | 8, 0 ..= 255, 1 / 1;
     }
     /// Key and high-voltage state, range, counters.
-    board_state "BoardState" = 0x131, Transmitted, 100 ms + 60 ms {
+    board_state "BoardState" = 0x131, Transmitted, 100 ms + 40 ms {
         KEY "KeyState" = unsigned 0 | 3, 0 ..= 3, not available 7, 1 / 1;
         HIGH_VOLTAGE "HighVoltage" = unsigned 3 | 2, 0 ..= 1, not available 3, 1 / 1;
         PERMIT "HighVoltagePermit" = unsigned 5 | 1, 0 ..= 1, 1 / 1;
@@ -298,13 +298,13 @@ messages! {
         REFUSED "RefusedFrames" = unsigned 56 | 8, 0 ..= 255, 1 / 1;
     }
     /// Active diagnoses.
-    diagnosis_active "DiagnosisActive" = 0x140, Transmitted, 100 ms + 70 ms, codes "Active" {
+    diagnosis_active "DiagnosisActive" = 0x140, Transmitted, 100 ms + 50 ms, codes "Active" {
     }
     /// Latched diagnoses.
-    diagnosis_latched "DiagnosisLatched" = 0x141, Transmitted, 100 ms + 80 ms, codes "Latched" {
+    diagnosis_latched "DiagnosisLatched" = 0x141, Transmitted, 100 ms + 60 ms, codes "Latched" {
     }
     /// One reported diagnosis.
-    diagnosis_detail "DiagnosisDetail" = 0x142, Transmitted, 100 ms + 90 ms {
+    diagnosis_detail "DiagnosisDetail" = 0x142, Transmitted, 100 ms + 70 ms {
         CODE "DiagnosisCode" = unsigned 0 | 8, 0 ..= 254, not available 255, 1 / 1;
         SEVERITY "DiagnosisSeverity" = unsigned 8 | 2, 0 ..= 3, 1 / 1;
         ACTIVE "DiagnosisIsActive" = unsigned 10 | 1, 0 ..= 1, 1 / 1;
@@ -314,7 +314,7 @@ messages! {
         FIRST_SEEN "DiagnosisFirstSeen" = unsigned 40 | 24, 0 ..= 16_777_214, not available 16_777_215, 1 / 1;
     }
     /// Identity pages.
-    identity "Identity" = 0x150, Transmitted, 200 ms + 100 ms {
+    identity "Identity" = 0x150, Transmitted, 200 ms + 80 ms {
         PAGE "IdentityPage" = unsigned 0 | 8, 0 ..= 5, 1 / 1;
         PROTOCOL "ProtocolVersion" = unsigned 8 | 8, 0 ..= 255, 1 / 1, page 0;
         MAJOR "FirmwareMajor" = unsigned 16 | 8, 0 ..= 255, 1 / 1, page 0;

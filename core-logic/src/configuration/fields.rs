@@ -394,14 +394,14 @@ fields! {
     0x0602 U32 1 Always (1, 1_000_000) "chatter: edges" "" "within one window from which on it is chatter" [at chatter.edges];
     0x0614 I32 1 Always (0, 100_000_000) "flag: margin above" "µA" "beyond the switching current, on the small sensor" [at flag.margin_above];
     0x0616 I32 1 Always (0, 100_000_000) "flag: margin below" "µA" "below the switching current, on the large sensor" [at flag.margin_below];
-    0x0618 I32 1 Always (1, 100_000_000) "flag: match tolerance" "µA" "between readings of one sensor" [at flag.match_tolerance];
+    0x0618 I32 1 Always (500_000, 100_000_000) "flag: match tolerance" "µA" "between readings of one sensor" [at flag.match_tolerance];
     0x061A U32 1 Always (0, 169) "flag: debounce" "ms" "with one conversion on top below 200 ms" [at flag.debounce_ms];
-    0x0620 U16 1 Always (1, 10_000) "edge storm: events" "" "within the window" [at edge_storm.events];
-    0x0622 U32 1 Always (10, 1_000_000) "edge storm: window" "µs" "" [at edge_storm.window_us];
-    0x0624 U32 1 Always (10, 1_000_000) "edge storm: hold-off" "µs" "for which the line stays masked" [at edge_storm.hold_off_us];
-    0x0628 U16 1 Always (1, 10_000) "meter line storm: events" "" "within the window" [at meter_line_storm.events];
-    0x062A U32 1 Always (10, 1_000_000) "meter line storm: window" "µs" "" [at meter_line_storm.window_us];
-    0x062C U32 1 Always (10, 1_000_000) "meter line storm: hold-off" "µs" "for which the line stays masked" [at meter_line_storm.hold_off_us];
+    0x0620 U16 1 Always (1, 100) "edge storm: events" "" "within the window" [at edge_storm.events];
+    0x0622 U32 1 Always (500, 1_000_000) "edge storm: window" "µs" "at least 50 µs for each of the events" [at edge_storm.window_us];
+    0x0624 U32 1 Always (500, 1_000_000) "edge storm: hold-off" "µs" "for which the line stays masked; at least 50 µs for each of the events" [at edge_storm.hold_off_us];
+    0x0628 U16 1 Always (1, 100) "meter line storm: events" "" "within the window" [at meter_line_storm.events];
+    0x062A U32 1 Always (500, 1_000_000) "meter line storm: window" "µs" "at least 50 µs for each of the events" [at meter_line_storm.window_us];
+    0x062C U32 1 Always (500, 1_000_000) "meter line storm: hold-off" "µs" "for which the line stays masked; at least 50 µs for each of the events" [at meter_line_storm.hold_off_us];
     0x0640 U32 1 Always (100, 60_000) "channels: fast window" "ms" "over which meter and converter are compared" [at compare.fast_window_ms];
     0x0642 U32 1 Always (100, 600_000) "channels: slow window" "ms" "the same with the finer bound; longer than the fast one" [at compare.slow_window_ms];
     0x0644 I32 1 Always (0, 500_000) "channels: gain tolerance" "ppm" "share by which they may differ" [at compare.gain_tolerance];
@@ -423,7 +423,7 @@ fields! {
     0x0716 I32 1 Always (0, 500_000) "capacity uncertainty" "ppm" "half-width of the capacity" [at soc.capacity_uncertainty];
     0x0718 U32 1 Always (1, 10_000) "presented slew" "ppm/s" "rate at which the presented state of charge follows an anchoring" [at soc.presented_slew_ppm_per_s];
 
-    0x0780 U16 1 Always (2, MAX_POINTS) "open-circuit points" "" "points in use, from the first" [at ocv.count];
+    0x0781 U16 1 Always (2, MAX_POINTS) "open-circuit points" "" "points in use, from the first; written with the table in one request" [at ocv.count];
     0x0782 I32 21 Always (0, 1_000_000) "open-circuit state of charge" "ppm" "of each point, rising from 0 to 1,000,000" [each ocv.points ; soc];
     0x07AC I32 21 Always (0, 5_000_000) "open-circuit voltage" "µV" "of each point, rising; one cell" [each ocv.points ; voltage];
 

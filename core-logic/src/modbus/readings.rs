@@ -76,6 +76,8 @@ readings! {
     activity: Activity,
     /// Flash is being written or erased.
     storage_busy: bool,
+    /// The configuration is being saved or restored, or will be.
+    configuration_in_transfer: bool,
     /// The last command's register value.
     last_command: u16,
     /// How it ended.
@@ -268,7 +270,7 @@ inputs! {
     0x0004 U32 1 "revision" "" "first 32 bits of the firmware's revision hash" |r, _| r.revision.into();
     0x0006 U32 3 "unique number" "" "of the microcontroller" |r, i| element(&r.unique_id, i);
     0x000C U16 1 "configuration format" "" "version of the configuration record" |_, _| crate::configuration::VERSION.into();
-    0x000D U16 1 "reset cause" "bits" "1 power, 2 reset pin, 4 software, 8 independent watchdog, 16 window watchdog, 32 low power, 64 brown-out" |r, _| r.reset_cause.into();
+    0x000D U16 1 "reset cause" "bits" "the weightiest: 1 power, 2 reset pin, 4 software, 8 independent watchdog, 16 window watchdog, 32 low power, 64 brown-out" |r, _| r.reset_cause.into();
     0x000E U32 1 "uptime" "s" "time since the start" |r, _| r.uptime_s.into();
     0x0010 U32 1 "resets" "" "resets since the retained memory was last lost" |r, _| r.resets.into();
     0x0012 U32 1 "panic" "" "hash of the last panic, 0 without one" |r, _| r.panic_hash.into();
@@ -306,8 +308,8 @@ inputs! {
 
     // Charge.
     0x0060 I64 1 "charge" "mC" "net, positive is discharge (1 mC = 1 mA·s)" |r, _| mc(r.charge);
-    0x0064 I64 1 "charge in" "mC" "charged" |r, _| mc(r.charge_in);
-    0x0068 I64 1 "charge out" "mC" "discharged" |r, _| mc(r.charge_out);
+    0x0064 I64 1 "charge in" "mC" "charged since the start; `charge` goes on over it" |r, _| mc(r.charge_in);
+    0x0068 I64 1 "charge out" "mC" "discharged since the start" |r, _| mc(r.charge_out);
     0x006C I64 1 "charge uncertainty" "mC" "bound on what the last start, hand-overs and bridged gaps may have cost" |r, _| mc(r.charge_uncertainty);
     0x0070 I64 1 "channel difference" "mC" "meter less converter over the last window" |r, _| mc(r.channel_difference);
     0x0074 I64 1 "channel bound" "mC" "what they may differ by" |r, _| mc(r.channel_bound);

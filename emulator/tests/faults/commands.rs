@@ -88,6 +88,52 @@ fn fault_f25_a_zero_at_the_wrong_time_is_refused_and_the_old_one_stays() {
 }
 
 #[test]
+fn fault_f25_what_is_ordered_of_the_flash_waits_for_the_order_before() {
+    const CAPACITY: u16 = 0x0700;
+    let capacity = |rig: &mut Rig<'_>| holding_registers(rig, CAPACITY, 2);
+    let mah = |mah: u32| [(mah >> 16) as u16, mah as u16];
+    let (save, restore, factory_defaults, clear_log) = (7, 8, 9, 10);
+    let mut rig = parked();
+    write_registers(&mut rig, CAPACITY, &mah(100_000)).unwrap();
+    let written = input_registers(&mut rig, 0x0148, 2);
+    command(&mut rig, save).unwrap();
+    for number in [restore, factory_defaults, save, clear_log] {
+        assert_eq!(command(&mut rig, number), Err(6), "{number} after a save");
+    }
+    let answer = write_registers(&mut rig, CAPACITY, &mah(200_000));
+    assert_eq!(answer, Err(6), "a setting after a save");
+    until(&mut rig, "the save", 1.0, |rig| state(rig).0 == 2);
+    assert_ne!(input_registers(&mut rig, 0x0148, 2), written);
+    assert_eq!(capacity(&mut rig), mah(100_000));
+
+    write_registers(&mut rig, CAPACITY, &mah(300_000)).unwrap();
+    command(&mut rig, restore).unwrap();
+    for number in [save, factory_defaults, restore, clear_log] {
+        let answer = command(&mut rig, number);
+        assert_eq!(answer, Err(6), "{number} after a restore");
+    }
+    let answer = write_registers(&mut rig, CAPACITY, &mah(200_000));
+    assert_eq!(answer, Err(6), "a setting after a restore");
+    until(&mut rig, "the restore", 1.0, |rig| state(rig).0 == 2);
+    assert_eq!(capacity(&mut rig), mah(100_000));
+
+    command(&mut rig, factory_defaults).unwrap();
+    assert_eq!(capacity(&mut rig), mah(240_000));
+    command(&mut rig, clear_log).unwrap();
+    // The log has nothing to do with the settings.
+    write_registers(&mut rig, CAPACITY, &mah(200_000)).unwrap();
+    assert_eq!(
+        command(&mut rig, restore),
+        Err(6),
+        "while the log is cleared"
+    );
+    until(&mut rig, "the clearing", 2.0, |rig| state(rig).0 == 2);
+    rig.power_cycle();
+    rig.run_s(1.0).unwrap();
+    assert_eq!(capacity(&mut rig), mah(100_000), "what was saved");
+}
+
+#[test]
 fn fault_f26_range_changes_during_calibration_save_and_bus_errors() {
     let mut rig = parked();
     set_zero_drift(&mut rig, 123_000);

@@ -489,6 +489,59 @@ fn used_flash() -> Vec<u8> {
     flash
 }
 
+/// 100 Ah saved, and a chip without power for the first `late_s`.
+fn boot_late(late_s: f64) -> Rig<'static> {
+    let mut rig = boot(Vec::new(), 0.0);
+    rig.run_s(0.4).unwrap();
+    set_capacity(&mut rig, 100_000);
+    save(&mut rig);
+    let flash = content(&mut rig);
+    let mut rig = boot_parked(flash, Timing::TYPICAL, 0.0);
+    board(&mut rig, |board| {
+        board.flash.power_off(0.0);
+        board.flash.power_on(late_s);
+    });
+    rig
+}
+
+#[test]
+fn fault_f20_a_flash_that_answers_late_costs_nothing() {
+    for late_s in [0.05, 0.3] {
+        let mut rig = boot_late(late_s);
+        rig.run_s(1.0).unwrap();
+        println!("F20 {late_s} s late: {:?}", unexpected(&rig, &[]));
+        assert_eq!(capacity(&mut rig), 100_000, "{late_s} s");
+        assert!(!was_raised(&rig, "ConfigurationDefault"), "{late_s} s");
+        assert!(!was_raised(&rig, "FlashFault"), "{late_s} s");
+        assert_eq!(resets(&rig), 0);
+    }
+}
+
+#[test]
+fn fault_f20_a_flash_that_comes_too_late_for_the_start_is_used_all_the_same() {
+    let mut rig = boot_late(2.5);
+    rig.run_s(1.0).unwrap();
+    assert!(was_raised(&rig, "ConfigurationDefault"));
+    // As long as it is missing, and not longer.
+    let mut seen = 0;
+    watch(&mut rig, 1.0, |rig| {
+        seen += usize::from(rig.view.active_diagnoses().contains(&"FlashFault"));
+    });
+    assert_eq!(seen, 1_000);
+    assert!(rig.view.current_a().valid().is_some());
+    rig.run_s(2.5).unwrap();
+    assert!(!rig.view.active_diagnoses().contains(&"FlashFault"));
+    // The state is saved, and what was saved before can be had.
+    assert!(touched(&mut rig) > 0);
+    assert_eq!(capacity(&mut rig), 240_000);
+    command(&mut rig, 8).unwrap();
+    until(&mut rig, "the restore", 1.0, |rig| {
+        input_registers(rig, 0x0023, 1) == [2]
+    });
+    assert_eq!(capacity(&mut rig), 100_000);
+    assert_eq!(resets(&rig), 0);
+}
+
 /// The same with high voltage off; `shift_v` at the sensor's output looks like a current to the meter.
 fn boot_parked(flash: Vec<u8>, timing: Timing, shift_v: f64) -> Rig<'static> {
     let mut row = row(0.0).with_key(Key::Off);

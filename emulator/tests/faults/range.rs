@@ -88,6 +88,49 @@ fn fault_f09_chatter_loses_no_edge_and_stays_within_the_declared_charge() {
     }
 }
 
+/// The most that the settings of the storm may let through: in windows of each length.
+#[test]
+fn fault_f09_no_storm_setting_lets_chatter_starve_the_board() {
+    for (events, window_us, hold_off_us) in
+        [(10, 500, 500), (100, 5_000, 5_000), (100, 1_000_000, 5_000)]
+    {
+        let mut rig = steady(53.3);
+        let [w0, w1, h0, h1] = [window_us >> 16, window_us, hold_off_us >> 16, hold_off_us]
+            .map(|word: u32| word as u16);
+        // A register lies between the number and the times.
+        let order = if events > 20 { [1, 0] } else { [0, 1] };
+        for part in order {
+            let answer = match part {
+                0 => write_registers(&mut rig, 0x0620, &[events]),
+                _ => write_registers(&mut rig, 0x0622, &[w0, w1, h0, h1]),
+            };
+            assert_eq!(answer, Ok(()), "{events} in {window_us} µs, part {part}");
+        }
+        for pattern in ["100kHz,50%", "30kHz,50%"] {
+            rig.machine.restart_load();
+            rig.view.restart_periods();
+            strike(&mut rig, &format!("F9:{pattern},1500ms"));
+            rig.run_s(1.5).unwrap();
+            let load = rig.machine.load().share();
+            let longest_s = rig.view.period("Current").longest_s;
+            println!(
+                "F9 {pattern}, {events} in {window_us} µs: load {:.1} %, frames at most {:.2} ms apart",
+                load * 100.0,
+                longest_s * 1e3
+            );
+            assert!(load < 0.5, "{pattern}: {load}");
+            assert!(longest_s < 0.0125, "{pattern}: {longest_s}");
+            assert_eq!(resets(&rig), 0);
+        }
+    }
+    // Beyond: what let 100 kHz end in a watchdog reset.
+    let mut rig = steady(0.0);
+    assert_eq!(write_registers(&mut rig, 0x0620, &[101]), Err(3));
+    assert_eq!(write_registers(&mut rig, 0x0620, &[21]), Err(3));
+    assert_eq!(write_registers(&mut rig, 0x0622, &[0, 499]), Err(3));
+    assert_eq!(write_registers(&mut rig, 0x0624, &[0, 999]), Err(3));
+}
+
 #[test]
 fn fault_f10_a_flag_against_the_level_is_found_and_the_charge_is_doubted() {
     for (stuck, current_a) in [("high", 30.0), ("low", 100.0), ("low", -250.0)] {

@@ -266,7 +266,7 @@ fn remedy(model: &Model, signal: &str, id: &str, parameters: &BTreeMap<String, f
         "stray-field" => Remedy::None("it does not know the neighbouring conductor's current"),
         "parasitic-load" => Remedy::None("it cannot measure what flows ahead of its sensor"),
         "ocv-hysteresis" | "entropic" => {
-            Remedy::None("its open-circuit table (0x0780) is one curve at one temperature")
+            Remedy::None("its open-circuit table (0x0781) is one curve at one temperature")
         }
         _ => Remedy::None("it calculates no voltage under load"),
     }
