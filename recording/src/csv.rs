@@ -387,6 +387,11 @@ impl Writer {
         self.file.finish()
     }
 
+    /// All rows are written: the file, to get its name together with others.
+    pub fn into_file(self) -> WholeFile {
+        self.file
+    }
+
     fn end_line(&mut self) -> Result<()> {
         self.line.push('\n');
         let done = self.file.write_all(self.line.as_bytes());

@@ -42,6 +42,8 @@ pub enum Kind {
     Unsupported,
     /// A name mapping that cannot be followed.
     Mapping,
+    /// The file to be written is one that is read.
+    Overwrites,
 }
 
 /// Where in a file.

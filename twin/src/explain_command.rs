@@ -10,13 +10,15 @@ use std::{
 };
 
 use clap::Args;
-use recording::{Error, output::WholeFile};
+use recording::{
+    Error,
+    output::{self, WholeFile},
+};
 
 use crate::{
     explain::{self, Holdout, Options},
     failure::Failure,
     model::{Found, Model, Shift, registry},
-    overwrite,
     prepare::{Inputs, Item, Prepared, Purpose, prepare},
     progress::Progress,
     report::{
@@ -103,10 +105,10 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     read.extend(reference.map(|path| ("--reference", path.as_path())));
     let holdout = arguments.holdout.iter();
     read.extend(holdout.map(|path| ("--holdout", path.as_path())));
-    let refuse = |read: &[(&str, &Path)]| {
+    let refuse = |read: &[(&str, &Path)]| -> recording::Result<()> {
         FILES
             .iter()
-            .try_for_each(|name| overwrite::refuse(&out.join(name), read.iter().copied()))
+            .try_for_each(|name| output::refuse_overwrite(&out.join(name), read.iter().copied()))
     };
     refuse(&read)?;
     let model = Model::read(&arguments.model)?;
