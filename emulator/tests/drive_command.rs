@@ -60,7 +60,12 @@ fn a_profile_that_cannot_be_driven_is_refused_with_file_line_and_column() {
         (
             "nan.csv",
             "t_s,i_ref_a\n0,1\n1,NaN\n",
-            &["line 3", "i_ref_a", "NaN"],
+            &["line 3", "i_ref_a"],
+        ),
+        (
+            "text.csv",
+            "t_s,i_ref_a,key,note\n0,1,2,a\n1,1,on,b\n",
+            &["line 3", "column 3 (key)", "\"on\""],
         ),
         ("gap.csv", "t_s,i_ref_a\n0,1\n1,\n", &["line 3", "i_ref_a"]),
         (

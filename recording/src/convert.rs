@@ -146,13 +146,15 @@ pub fn read(path: &Path, options: &Options, progress: &mut dyn FnMut(f64)) -> Re
             if format == Format::Mdf {
                 return from_mdf(&source, &bytes, options);
             }
-            let (table, left_out) = if format == Format::Parquet {
-                let contents = parquet::parse(&source, bytes)?;
-                (contents.table, contents.left_out)
+            let table = if format == Format::Parquet {
+                parquet::parse(&source, bytes)?
             } else {
-                (csv::parse(&source, &bytes)?, Vec::new())
+                csv::parse(&source, &bytes)?
             };
+            let replaced = replaced(&options.mapping, &table);
             let recording = table.mapped(&options.mapping)?.into_recording()?;
+            let mut left_out = recording.table().left_out();
+            left_out.extend(replaced);
             return Ok(Converted {
                 format,
                 counts: None,
@@ -173,12 +175,25 @@ pub fn read(path: &Path, options: &Options, progress: &mut dyn FnMut(f64)) -> Re
     );
     let counts = log(&source, reader, &mut |frame| decoder.frame(frame))?;
     let (series, decoded) = decoder.finish()?;
+    let merged = Merged::new(&source, series)?;
     Ok(Converted {
         format,
         counts: Some((counts, decoded)),
-        left_out: Vec::new(),
-        content: Content::Merged(Merged::new(&source, series)?.mapped(&options.mapping)?),
+        left_out: replaced(&options.mapping, &merged),
+        content: Content::Merged(merged.mapped(&options.mapping)?),
     })
+}
+
+/// Columns whose names the mapping gives to others, and that get no name themselves.
+fn replaced(mapping: &Mapping, columns: &dyn Columns) -> Vec<String> {
+    let names = columns.names();
+    let plain = |from: &str| from.strip_prefix('-').unwrap_or(from).to_owned();
+    mapping
+        .pairs()
+        .filter(|(to, _)| names.contains(to))
+        .filter(|(to, _)| mapping.pairs().all(|(_, from)| plain(from) != *to))
+        .map(|(to, from)| format!("{to} ({} has its name now)", plain(from)))
+        .collect()
 }
 
 /// Measured signals and logged frames of one file, merged.
@@ -194,11 +209,14 @@ fn from_mdf(source: &str, bytes: &[u8], options: &Options) -> Result<Converted> 
         series.extend(decoded_series);
         counts = Some((contents.counts, decoded));
     }
+    let merged = Merged::new(source, series)?.leaving_out(contents.left_out.clone());
+    let mut left_out = contents.left_out;
+    left_out.extend(replaced(&options.mapping, &merged));
     Ok(Converted {
         format: Format::Mdf,
         counts,
-        left_out: contents.left_out,
-        content: Content::Merged(Merged::new(source, series)?.mapped(&options.mapping)?),
+        left_out,
+        content: Content::Merged(merged.mapped(&options.mapping)?),
     })
 }
 
@@ -273,7 +291,7 @@ pub fn recording(path: &Path, mapping: &Mapping) -> Result<Recording> {
         .read(&mut start)
         .map_err(|error| Error::reading(path, &error))?;
     let table = match Format::of(path, &start[..length]) {
-        Format::Parquet => parquet::read(path)?.table,
+        Format::Parquet => parquet::read(path)?,
         _ => csv::read_table(path)?,
     };
     table.mapped(mapping)?.into_recording()

@@ -186,6 +186,11 @@ impl Error {
         &self.0.file
     }
 
+    /// What was found there.
+    pub fn found(&self) -> &str {
+        &self.0.found
+    }
+
     /// Where in the file.
     pub fn place(&self) -> &Place {
         &self.0.place

@@ -205,6 +205,20 @@ fn groups_tell_equal_names_apart() {
 }
 
 #[test]
+fn an_infinite_value_is_no_value_of_a_recording() {
+    let mut records = [[0; 20]; 3];
+    for (record, value) in records.iter_mut().zip([1.0, f32::NAN, f32::INFINITY]) {
+        record[8..12].copy_from_slice(&value.to_le_bytes());
+    }
+    let contents = mdf::read("m.mf4", &measured(8, 0, 32, FLOAT, &records)).unwrap();
+    let why = "x (an infinite value in record 3)";
+    assert_eq!(contents.left_out, [why, why]);
+    // What is not a number is missing.
+    let contents = mdf::read("m.mf4", &measured(8, 0, 32, FLOAT, &records[..2])).unwrap();
+    assert!(contents.series[0].signals[0].values[1].is_nan());
+}
+
+#[test]
 fn what_is_not_read_is_said() {
     let cases: [(Vec<u8>, Kind, &str); 6] = [
         (

@@ -92,6 +92,24 @@ fn two_units() {
 }
 
 #[test]
+fn text_where_numbers_are_needed() {
+    // A note is nobody's concern, what the model uses is.
+    let noted = |name: &str| {
+        format!("t_s,i_ref_a,i_meas_a,{name}\n")
+            + &rows(300, |t| {
+                format!("{t},{},{},on", current(t), current(t) + 0.5)
+            })
+    };
+    says(
+        &explained(PAIR, &noted("temp_sensor_c")),
+        &["r.csv, line 2, column 4 (temp_sensor_c): found \"on\""],
+    );
+    let text = good().replacen(&format!("{}", current(0.0)), "1,0 A", 1);
+    assert!(text.contains("1,0 A"));
+    says(&explained(PAIR, &text), &["r.csv, line 2"]);
+}
+
+#[test]
 fn opposite_signs() {
     let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
         + &rows(300, |t| format!("{t},{},{}", current(t), -current(t)));

@@ -171,6 +171,35 @@ fn bad_input_ends_with_2_and_leaves_nothing() {
 }
 
 #[test]
+fn what_a_mapping_replaces_is_said() {
+    let folder = folder();
+    fs::write(
+        folder.path().join("both.csv"),
+        "t_s,i_ref_a,i_meas_a,note\n0,1,0,x\n1,2,4,y\n",
+    )
+    .unwrap();
+    let output = twin(
+        folder.path(),
+        &[
+            "convert",
+            "both.csv",
+            "--out",
+            "out.csv",
+            "--map",
+            "i_ref_a=-i_meas_a",
+        ],
+    );
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    let said = text(&output.stdout);
+    assert!(
+        said.contains("left out: note (\"x\" in line 2), i_ref_a (i_meas_a has its name now)"),
+        "{said}"
+    );
+    let out = fs::read_to_string(folder.path().join("out.csv")).unwrap();
+    assert_eq!(out, "t_s,i_ref_a\n0,0\n1,-4\n");
+}
+
+#[test]
 fn help_has_an_example_and_wrong_arguments_end_with_2() {
     let folder = folder();
     let help = twin(folder.path(), &["convert", "--help"]);

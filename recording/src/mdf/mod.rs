@@ -452,11 +452,21 @@ impl Group<'_> {
                 contents.left_out.push(why);
                 continue;
             };
+            let values = self.values(file, channel, &rule)?;
+            if let Some(record) = values.iter().position(|value| value.is_infinite()) {
+                let why = format!(
+                    "{} (an infinite value in record {})",
+                    channel.name,
+                    record + 1
+                );
+                contents.left_out.push(why);
+                continue;
+            }
             signals.push(Signal {
                 name: unit::column_name(&channel.name, unit),
                 bare: channel.name.clone(),
                 unit: unit.map(|unit| unit.symbol),
-                values: self.values(file, channel, &rule)?,
+                values,
             });
         }
         if !signals.is_empty() {
@@ -489,10 +499,8 @@ impl Group<'_> {
                 let raw = channel
                     .raw(record, index)
                     .ok_or_else(|| outside(file, channel))?;
-                let value = rule.apply(raw);
-                // What a recording cannot carry is missing in it.
-                let valid = value.is_finite() && !channel.invalid(inval);
-                Ok(if valid { value } else { f64::NAN })
+                let valid = !channel.invalid(inval);
+                Ok(if valid { rule.apply(raw) } else { f64::NAN })
             })
             .collect()
     }
@@ -525,7 +533,7 @@ impl Group<'_> {
             let fault = |kind, found: String, expected: String| {
                 Err(Error::new(kind, file.source, place(), found, expected))
             };
-            if now_s.is_nan() {
+            if !now_s.is_finite() {
                 return fault(Kind::TimeMissing, "no time".into(), "a time in s".into());
             }
             if now_s < last_s {
