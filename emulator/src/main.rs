@@ -208,11 +208,22 @@ fn main() -> ExitCode {
     }
 }
 
+/// On standard output, where a reader that has seen enough is no failure.
+fn say(text: &str) -> Result<(), Failure> {
+    let mut out = io::stdout();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Failure::Input(format!(
+            "standard output: found \"{error}\" from the system, expected a place that can be written"
+        ))),
+        _ => Ok(()),
+    }
+}
+
 fn bench(image: Option<PathBuf>, quick: bool) -> Result<(), Failure> {
     let path = image.unwrap_or_else(rig::default_image);
     let firmware = Firmware::load(&path).map_err(|error| Failure::Input(format!("{error:#}")))?;
     let figures = emulator::bench::run(&firmware, quick)?;
-    print!("{}", emulator::bench::Table(&figures));
+    say(&emulator::bench::Table(&figures).to_string())?;
     let missed = figures.iter().filter(|figure| !figure.holds()).count();
     if missed > 0 {
         return Err(Failure::Check(format!(
@@ -226,7 +237,10 @@ fn bench(image: Option<PathBuf>, quick: bool) -> Result<(), Failure> {
 fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
     if arguments.list_faults {
         for fault in faults::CATALOGUE {
-            println!("{:<5}{}: {}", fault.id, fault.title, fault.parameters);
+            say(&format!(
+                "{:<5}{}: {}\n",
+                fault.id, fault.title, fault.parameters
+            ))?;
         }
         return Ok(());
     }
@@ -290,9 +304,9 @@ fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
     let text = drive::summary(&figures);
     let json = report(arguments, &figures).map_err(|error| Failure::Image(error.to_string()))?;
     drive.finish(&text, &json)?;
-    print!("{text}");
+    say(&text)?;
     if let Some(out) = &arguments.out {
-        println!("{:<16}{}", "written to", out.display());
+        say(&format!("{:<16}{}\n", "written to", out.display()))?;
     }
     let complaints = drive::complaints(&figures);
     if arguments.check && !complaints.is_empty() {
@@ -328,14 +342,14 @@ fn refuse_late(
     end_s: f64,
 ) -> Result<(), Failure> {
     let end = Ticks::from_seconds(end_s);
-    let late = arguments.fault.iter().zip(injections);
-    for (text, injection) in late.filter(|(_, injection)| injection.strikes_after(end)) {
-        return Err(Failure::Input(format!(
+    let mut all = arguments.fault.iter().zip(injections);
+    match all.find(|(_, injection)| injection.strikes_after(end)) {
+        Some((text, injection)) => Err(Failure::Input(format!(
             "--fault {text}: found the time {} s, expected one before the drive ends, {end_s} s after power-on",
             injection.at.seconds()
-        )));
+        ))),
+        None => Ok(()),
     }
-    Ok(())
 }
 
 fn run(drive: &mut Drive<'_>, end_s: f64, stop: &AtomicBool) -> Result<(), Failure> {

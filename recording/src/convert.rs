@@ -136,6 +136,15 @@ pub fn read(path: &Path, options: &Options, progress: &mut dyn FnMut(f64)) -> Re
         },
     );
     let start = reader.fill_buf().map_err(|error| fault(&error))?;
+    if start.is_empty() {
+        return Err(Error::new(
+            Kind::Empty,
+            source,
+            Place::default(),
+            "an empty file",
+            "a log or a recording",
+        ));
+    }
     let format = Format::of(path, start);
     let log = match format {
         Format::Csv | Format::Mdf | Format::Parquet => {
@@ -284,15 +293,29 @@ pub fn is_parquet(path: &Path) -> Result<bool> {
 
 /// Reads a recording in either canonical form, CSV or Parquet.
 pub fn recording(path: &Path, mapping: &Mapping) -> Result<Recording> {
-    let mut start = [0; 4];
-    let mut file = File::open(path).map_err(|error| Error::reading(path, &error))?;
-    // An empty file is told by the reader of CSV.
-    let length = file
-        .read(&mut start)
-        .map_err(|error| Error::reading(path, &error))?;
-    let table = match Format::of(path, &start[..length]) {
-        Format::Parquet => parquet::read(path)?,
-        _ => csv::read_table(path)?,
-    };
-    table.mapped(mapping)?.into_recording()
+    table(path)?.mapped(mapping)?.into_recording()
+}
+
+/// The same without a look at its time. A log is refused by its name.
+pub fn table(path: &Path) -> Result<Table> {
+    let mut start = Vec::new();
+    let reading = |error: io::Error| Error::reading(path, &error);
+    let file = File::open(path).map_err(reading)?;
+    file.take(16).read_to_end(&mut start).map_err(reading)?;
+    let ending = path.extension().and_then(|ending| ending.to_str());
+    match Format::of(path, &start) {
+        Format::Parquet => parquet::read(path),
+        // An empty file is told by the reader of CSV, and a name of a column may begin as a log does.
+        Format::Csv => csv::read_table(path),
+        Format::Candump | Format::Asc if start.is_empty() || ending == Some("csv") => {
+            csv::read_table(path)
+        }
+        log => Err(Error::new(
+            Kind::Unsupported,
+            path.display().to_string(),
+            Place::default(),
+            format!("a log ({})", log.name()),
+            "a recording as CSV or Parquet: `twin convert` makes one of it",
+        )),
+    }
 }

@@ -53,6 +53,7 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
         mapping: Mapping::parse(arguments.map.iter().map(String::as_str))?,
     };
     convert::is_parquet(&arguments.out)?;
+    output::check(&arguments.out)?;
     let mut reading = Progress::new(format!("reading {}", arguments.input.display()));
     let converted = convert::read(&arguments.input, &options, &mut |share| reading.at(share))?;
     drop(reading);

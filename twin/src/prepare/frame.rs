@@ -1,8 +1,8 @@
 //! A recording under the names of the model file, with its signs.
 
-use std::{fs::File, io::Read, ops::Range, path::Path};
+use std::ops::Range;
 
-use recording::{Error, Mapping, Recording, Table, convert::Format, csv, parquet};
+use recording::{Mapping, Recording, Table, convert};
 
 use super::{Inputs, PAIRS, SURROUNDINGS};
 use crate::{failure::Failure, model::Model};
@@ -112,13 +112,13 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
             wanted.push((name.clone(), column.clone()));
         }
     }
-    let recording = table(&inputs.recording)?;
+    let recording = convert::table(&inputs.recording)?;
     let Some(reference) = &inputs.reference else {
         let frame = mapped(recording, &wanted)?;
         frame.refuse_left_out(model)?;
         return Ok((frame, None));
     };
-    let reference = table(reference)?;
+    let reference = convert::table(reference)?;
     // Each name belongs to the file that has its column; to the recording if both do.
     let (to_reference, rest): (Vec<_>, Vec<_>) = wanted.into_iter().partition(|(name, column)| {
         let has = |table: &Table| {
@@ -140,21 +140,6 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
     frame.refuse_left_out(model)?;
     other.refuse_left_out(model)?;
     Ok((frame, Some(other)))
-}
-
-/// CSV or Parquet.
-fn table(path: &Path) -> Result<Table, Failure> {
-    let mut start = Vec::new();
-    let reading = |error: std::io::Error| Error::reading(path, &error);
-    File::open(path)
-        .map_err(reading)?
-        .take(4)
-        .read_to_end(&mut start)
-        .map_err(reading)?;
-    Ok(match Format::of(path, &start) {
-        Format::Parquet => parquet::read(path)?,
-        _ => csv::read_table(path)?,
-    })
 }
 
 fn mapped(table: Table, wanted: &[(String, String)]) -> Result<Frame, Failure> {

@@ -58,6 +58,7 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     output::refuse_overwrite(&arguments.out, read.into_iter().chain(reference))?;
     let model = Model::read(&arguments.model)?;
     output::refuse_overwrite(&arguments.out, model.ocv_file())?;
+    output::check(&arguments.out)?;
     let inputs = Inputs {
         recording: arguments.recording.clone(),
         reference: arguments.reference.clone(),
