@@ -142,6 +142,7 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
         clock: None,
     };
     for frame in [Some(&frame), reference.as_ref()].into_iter().flatten() {
+        checks::time_goes_on(frame)?;
         let left_out = frame.left_out();
         if !left_out.is_empty() {
             work.remark(format!(
