@@ -14,7 +14,7 @@ use core_logic::error_budget::{ProfileSummary, charge_bound, no_load};
 use core_logic::units::{Duration, Microamps};
 use plant::violations::{Occurrences, Violations};
 use recording::csv::Writer;
-use recording::output::WholeFile;
+use recording::output::{self, Folder, WholeFile};
 
 use crate::board::{Snapshot, TruthSample};
 use crate::bus_view::BusView;
@@ -54,6 +54,18 @@ impl Outputs {
             summary_text: folder.join("summary.txt"),
             summary_json: folder.join("summary.json"),
         }
+    }
+
+    /// All of them.
+    pub fn all(&self) -> [&Path; 6] {
+        [
+            &self.can_log,
+            &self.recording,
+            &self.rs485_log,
+            &self.defmt_log,
+            &self.summary_text,
+            &self.summary_json,
+        ]
     }
 }
 
@@ -449,32 +461,6 @@ impl Flow {
     }
 }
 
-/// A folder that goes again if it was made here and nothing came into it.
-struct Folder {
-    path: PathBuf,
-    made: bool,
-}
-
-impl Folder {
-    fn make(path: &Path) -> Result<Self> {
-        let made = !path.exists();
-        std::fs::create_dir_all(path).map_err(|error| recording::Error::writing(path, &error))?;
-        Ok(Self {
-            path: path.to_owned(),
-            made,
-        })
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        if self.made {
-            // Refused where there are files in it.
-            let _ = std::fs::remove_dir(&self.path);
-        }
-    }
-}
-
 /// The files, written while it runs, named when it is done.
 struct Sink {
     can_log: BufWriter<WholeFile>,
@@ -677,8 +663,8 @@ impl Sink {
             self.view.take(logged.at, &logged.frame);
             self.tell(&logged)?;
         }
-        let files = Outputs::in_folder(&self.folder.path);
-        let mut finished = vec![];
+        let files = Outputs::in_folder(self.folder.path());
+        let mut finished = vec![self.recording.into_file()];
         for file in [self.can_log, self.rs485_log, self.defmt_log] {
             finished.push(file.into_inner().map_err(|error| error.into_error())?);
         }
@@ -688,11 +674,7 @@ impl Sink {
                 .map_err(|error| recording::Error::writing(path, &error))?;
             finished.push(file);
         }
-        self.recording.finish()?;
-        for file in finished {
-            file.finish()?;
-        }
-        Ok(())
+        Ok(output::finish_all(finished)?)
     }
 }
 

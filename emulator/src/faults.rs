@@ -321,6 +321,14 @@ pub struct Injection {
     pub at: Ticks,
 }
 
+impl Injection {
+    /// Whether a drive that ends at `end` never sees it.
+    pub fn strikes_after(&self, end: Ticks) -> bool {
+        // That one is done before power comes on.
+        self.at >= end && !matches!(self.fault, Fault::MeterWrap { .. })
+    }
+}
+
 /// When a fault strikes that was given without a time: the board has started and settled.
 pub const DEFAULT_TIME: Ticks = Ticks::from_millis(2_000);
 

@@ -3,19 +3,19 @@
 
 use std::fmt;
 use std::io::{self, IsTerminal as _, Write as _};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use clap::{Args, Parser, Subcommand};
 use plant::front_end::Sensors;
-use recording::Mapping;
+use recording::{Mapping, output};
 use serde_json::json;
 
 use emulator::calibration::{self, Calibration};
-use emulator::drive::{self, Drive, Figures};
-use emulator::faults;
+use emulator::drive::{self, Drive, Figures, Outputs};
+use emulator::faults::{self, Injection};
 use emulator::profile::{self, Profile, ProfileOptions};
 use emulator::rig::{self, Firmware, Setup};
 use emulator::scenario::{Contactors, Key, Row, Scenario};
@@ -37,6 +37,7 @@ enum Command {
     #[command(after_help = DRIVE_EXAMPLES)]
     Drive(Box<DriveArguments>),
     /// Measure the board's figures: latencies, periods, charge errors; exit code 1 if one is beyond its bound
+    #[command(after_help = BENCH_EXAMPLES)]
     Bench {
         /// The image; without it the one that `cargo xtask build` made last
         #[arg(long, value_name = "ELF")]
@@ -46,6 +47,11 @@ enum Command {
         quick: bool,
     },
 }
+
+const BENCH_EXAMPLES: &str = "\
+Examples:
+  cargo xtask bench
+  cargo xtask bench --quick";
 
 const DRIVE_EXAMPLES: &str = "\
 Examples:
@@ -79,16 +85,16 @@ struct DriveArguments {
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, allow_negative_numbers = true, value_parser = factor)]
     scale: f64,
     /// Leaves out so much of the profile's beginning
-    #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = seconds)]
+    #[arg(long, value_name = "SECONDS", allow_negative_numbers = true, default_value_t = 0.0, value_parser = seconds)]
     skip: f64,
     /// Takes so much of the profile; without it all
-    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    #[arg(long, value_name = "SECONDS", allow_negative_numbers = true, value_parser = seconds)]
     duration: Option<f64>,
     /// Rest before the profile, from power-on
-    #[arg(long, value_name = "SECONDS", default_value_t = 1.0, value_parser = seconds)]
+    #[arg(long, value_name = "SECONDS", allow_negative_numbers = true, default_value_t = 1.0, value_parser = seconds)]
     lead: f64,
     /// Longest step of the analogue simulation, 1 … 1000
-    #[arg(long, value_name = "µs", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    #[arg(long, value_name = "µs", allow_negative_numbers = true, default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1000))]
     step: u64,
     /// Seed of whatever is random: noise, bit errors, what a loss of power leaves
     #[arg(long, value_name = "NUMBER", default_value_t = 0)]
@@ -202,11 +208,22 @@ fn main() -> ExitCode {
     }
 }
 
+/// On standard output, where a reader that has seen enough is no failure.
+fn say(text: &str) -> Result<(), Failure> {
+    let mut out = io::stdout();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Failure::Input(format!(
+            "standard output: found \"{error}\" from the system, expected a place that can be written"
+        ))),
+        _ => Ok(()),
+    }
+}
+
 fn bench(image: Option<PathBuf>, quick: bool) -> Result<(), Failure> {
     let path = image.unwrap_or_else(rig::default_image);
     let firmware = Firmware::load(&path).map_err(|error| Failure::Input(format!("{error:#}")))?;
     let figures = emulator::bench::run(&firmware, quick)?;
-    print!("{}", emulator::bench::Table(&figures));
+    say(&emulator::bench::Table(&figures).to_string())?;
     let missed = figures.iter().filter(|figure| !figure.holds()).count();
     if missed > 0 {
         return Err(Failure::Check(format!(
@@ -220,7 +237,10 @@ fn bench(image: Option<PathBuf>, quick: bool) -> Result<(), Failure> {
 fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
     if arguments.list_faults {
         for fault in faults::CATALOGUE {
-            println!("{:<5}{}: {}", fault.id, fault.title, fault.parameters);
+            say(&format!(
+                "{:<5}{}: {}\n",
+                fault.id, fault.title, fault.parameters
+            ))?;
         }
         return Ok(());
     }
@@ -230,6 +250,7 @@ fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
         .map(|text| faults::parse(text).map_err(|error| Failure::Input(error.to_string())))
         .collect::<Result<Vec<_>, _>>()?;
     let path = arguments.image.clone().unwrap_or_else(rig::default_image);
+    refuse_overwrite(arguments, &path)?;
     let firmware = Firmware::load(&path).map_err(|error| Failure::Input(format!("{error:#}")))?;
     let profile = arguments
         .profile
@@ -240,6 +261,9 @@ fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
         .as_ref()
         .and_then(|profile| profile.rows.last())
         .map_or(0.0, |row| row.t_s);
+    if arguments.profile.is_some() && !arguments.serve {
+        refuse_late(arguments, &injections, end_s)?;
+    }
     let calibration = arguments
         .calibration
         .as_deref()
@@ -280,15 +304,52 @@ fn drive(arguments: &DriveArguments) -> Result<(), Failure> {
     let text = drive::summary(&figures);
     let json = report(arguments, &figures).map_err(|error| Failure::Image(error.to_string()))?;
     drive.finish(&text, &json)?;
-    print!("{text}");
+    say(&text)?;
     if let Some(out) = &arguments.out {
-        println!("{:<16}{}", "written to", out.display());
+        say(&format!("{:<16}{}\n", "written to", out.display()))?;
     }
     let complaints = drive::complaints(&figures);
     if arguments.check && !complaints.is_empty() {
         return Err(Failure::Check(complaints.join("; ")));
     }
     Ok(())
+}
+
+/// No file that is read is replaced by what is written down.
+fn refuse_overwrite(arguments: &DriveArguments, image: &Path) -> Result<(), Failure> {
+    let Some(folder) = &arguments.out else {
+        return Ok(());
+    };
+    let mut read = vec![("--image", image)];
+    read.extend(
+        arguments
+            .profile
+            .iter()
+            .map(|path| ("--profile", path.as_path())),
+    );
+    let calibration = arguments.calibration.iter();
+    read.extend(calibration.map(|path| ("--calibration", path.as_path())));
+    for path in Outputs::in_folder(folder).all() {
+        output::refuse_overwrite(path, read.iter().copied())?;
+    }
+    Ok(())
+}
+
+/// A fault that would never strike is no test.
+fn refuse_late(
+    arguments: &DriveArguments,
+    injections: &[Injection],
+    end_s: f64,
+) -> Result<(), Failure> {
+    let end = Ticks::from_seconds(end_s);
+    let mut all = arguments.fault.iter().zip(injections);
+    match all.find(|(_, injection)| injection.strikes_after(end)) {
+        Some((text, injection)) => Err(Failure::Input(format!(
+            "--fault {text}: found the time {} s, expected one before the drive ends, {end_s} s after power-on",
+            injection.at.seconds()
+        ))),
+        None => Ok(()),
+    }
 }
 
 fn run(drive: &mut Drive<'_>, end_s: f64, stop: &AtomicBool) -> Result<(), Failure> {

@@ -89,6 +89,9 @@ pub fn from_recording(
 ) -> recording::Result<Profile> {
     let time = recording.time_s();
     let current = recording.need("i_ref_a")?;
+    // One that is there must not count as not there.
+    let used = LIMITS.iter().map(|(name, ..)| *name).chain([KEY]);
+    recording.table().refuse_left_out(used)?;
     let optional = |name: &str| recording.column(name);
     let columns = Columns {
         sensor_temperature: optional("temp_sensor_c"),

@@ -60,7 +60,12 @@ fn a_profile_that_cannot_be_driven_is_refused_with_file_line_and_column() {
         (
             "nan.csv",
             "t_s,i_ref_a\n0,1\n1,NaN\n",
-            &["line 3", "i_ref_a", "NaN"],
+            &["line 3", "i_ref_a"],
+        ),
+        (
+            "text.csv",
+            "t_s,i_ref_a,key,note\n0,1,2,a\n1,1,on,b\n",
+            &["line 3", "column 3 (key)", "\"on\""],
         ),
         ("gap.csv", "t_s,i_ref_a\n0,1\n1,\n", &["line 3", "i_ref_a"]),
         (
@@ -180,6 +185,99 @@ fn a_place_that_cannot_be_written_is_refused_before_the_drive() {
         text(&output.stderr).contains("good.csv/out"),
         "{}",
         text(&output.stderr)
+    );
+}
+
+#[test]
+fn what_is_read_is_never_replaced() {
+    let folder = tempfile::tempdir().unwrap();
+    let place = folder.path().join("p");
+    fs::create_dir(&place).unwrap();
+    fs::write(place.join("board.csv"), PROFILE).unwrap();
+    fs::write(place.join("summary.txt"), "").unwrap();
+    fs::write(folder.path().join("drive.csv"), PROFILE).unwrap();
+    let image = default_image();
+    for (arguments, parts) in [
+        (
+            &["--profile", "p/board.csv"][..],
+            ["p/board.csv", "--profile"],
+        ),
+        (
+            &[
+                "--profile",
+                "drive.csv",
+                "--calibration",
+                "p/../p/summary.txt",
+            ],
+            ["p/summary.txt", "--calibration"],
+        ),
+    ] {
+        let image = ["--out", "p", "--image", image.to_str().unwrap()];
+        let output = emulate(folder.path(), &[arguments, &image].concat());
+        let message = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{message}");
+        assert_eq!(message.lines().count(), 1, "{message}");
+        assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+    }
+    assert_eq!(
+        fs::read_to_string(place.join("board.csv")).unwrap(),
+        PROFILE
+    );
+    assert_eq!(fs::read_dir(&place).unwrap().count(), 2);
+}
+
+#[test]
+fn a_disk_that_is_full_leaves_no_file() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("drive.csv"), PROFILE).unwrap();
+    // A limit on the size of a file stands for the disk. The smaller board.csv would fit, can.log does not.
+    for blocks in [16, 40] {
+        let output = Command::new("sh")
+            .current_dir(folder.path())
+            .args(["-c", "trap '' XFSZ; ulimit -f $0; exec \"$@\""])
+            .arg(blocks.to_string())
+            .args([env!("CARGO_BIN_EXE_emulate"), "drive", "--profile"])
+            .args(["drive.csv", "--out", "new/out", "--image"])
+            .arg(default_image())
+            .output()
+            .unwrap();
+        let message = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{message}");
+        assert_eq!(message.lines().count(), 1, "{message}");
+        assert!(!folder.path().join("new").exists());
+    }
+}
+
+#[test]
+fn a_fault_that_would_never_strike_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("drive.csv"), PROFILE).unwrap();
+    let image = default_image();
+    let with = |fault| {
+        [
+            "--image",
+            image.to_str().unwrap(),
+            "--profile",
+            "drive.csv",
+            "--fault",
+            fault,
+        ]
+    };
+    assert_refused(
+        folder.path(),
+        &with("F9@1e9"),
+        &["F9@1e9", "1000000000 s", "4 s"],
+    );
+    assert_refused(folder.path(), &with("F9@4"), &["F9@4", "4 s"]);
+    let fits = emulate(folder.path(), &with("F9@3.9"));
+    assert_eq!(fits.status.code(), Some(0), "{}", text(&fits.stderr));
+    let duration = [&with("F9@3")[..], &["--duration", "-1"]].concat();
+    let output = emulate(folder.path(), &duration);
+    assert_eq!(output.status.code(), Some(2));
+    let message = text(&output.stderr);
+    assert!(
+        message.contains("expected a number of seconds, 0 or more"),
+        "{message}"
     );
 }
 

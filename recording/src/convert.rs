@@ -136,6 +136,15 @@ pub fn read(path: &Path, options: &Options, progress: &mut dyn FnMut(f64)) -> Re
         },
     );
     let start = reader.fill_buf().map_err(|error| fault(&error))?;
+    if start.is_empty() {
+        return Err(Error::new(
+            Kind::Empty,
+            source,
+            Place::default(),
+            "an empty file",
+            "a log or a recording",
+        ));
+    }
     let format = Format::of(path, start);
     let log = match format {
         Format::Csv | Format::Mdf | Format::Parquet => {
@@ -146,13 +155,15 @@ pub fn read(path: &Path, options: &Options, progress: &mut dyn FnMut(f64)) -> Re
             if format == Format::Mdf {
                 return from_mdf(&source, &bytes, options);
             }
-            let (table, left_out) = if format == Format::Parquet {
-                let contents = parquet::parse(&source, bytes)?;
-                (contents.table, contents.left_out)
+            let table = if format == Format::Parquet {
+                parquet::parse(&source, bytes)?
             } else {
-                (csv::parse(&source, &bytes)?, Vec::new())
+                csv::parse(&source, &bytes)?
             };
+            let replaced = replaced(&options.mapping, &table);
             let recording = table.mapped(&options.mapping)?.into_recording()?;
+            let mut left_out = recording.table().left_out();
+            left_out.extend(replaced);
             return Ok(Converted {
                 format,
                 counts: None,
@@ -173,12 +184,25 @@ pub fn read(path: &Path, options: &Options, progress: &mut dyn FnMut(f64)) -> Re
     );
     let counts = log(&source, reader, &mut |frame| decoder.frame(frame))?;
     let (series, decoded) = decoder.finish()?;
+    let merged = Merged::new(&source, series)?;
     Ok(Converted {
         format,
         counts: Some((counts, decoded)),
-        left_out: Vec::new(),
-        content: Content::Merged(Merged::new(&source, series)?.mapped(&options.mapping)?),
+        left_out: replaced(&options.mapping, &merged),
+        content: Content::Merged(merged.mapped(&options.mapping)?),
     })
+}
+
+/// Columns whose names the mapping gives to others, and that get no name themselves.
+fn replaced(mapping: &Mapping, columns: &dyn Columns) -> Vec<String> {
+    let names = columns.names();
+    let plain = |from: &str| from.strip_prefix('-').unwrap_or(from).to_owned();
+    mapping
+        .pairs()
+        .filter(|(to, _)| names.contains(to))
+        .filter(|(to, _)| mapping.pairs().all(|(_, from)| plain(from) != *to))
+        .map(|(to, from)| format!("{to} ({} has its name now)", plain(from)))
+        .collect()
 }
 
 /// Measured signals and logged frames of one file, merged.
@@ -194,11 +218,14 @@ fn from_mdf(source: &str, bytes: &[u8], options: &Options) -> Result<Converted> 
         series.extend(decoded_series);
         counts = Some((contents.counts, decoded));
     }
+    let merged = Merged::new(source, series)?.leaving_out(contents.left_out.clone());
+    let mut left_out = contents.left_out;
+    left_out.extend(replaced(&options.mapping, &merged));
     Ok(Converted {
         format: Format::Mdf,
         counts,
-        left_out: contents.left_out,
-        content: Content::Merged(Merged::new(source, series)?.mapped(&options.mapping)?),
+        left_out,
+        content: Content::Merged(merged.mapped(&options.mapping)?),
     })
 }
 
@@ -266,15 +293,29 @@ pub fn is_parquet(path: &Path) -> Result<bool> {
 
 /// Reads a recording in either canonical form, CSV or Parquet.
 pub fn recording(path: &Path, mapping: &Mapping) -> Result<Recording> {
-    let mut start = [0; 4];
-    let mut file = File::open(path).map_err(|error| Error::reading(path, &error))?;
-    // An empty file is told by the reader of CSV.
-    let length = file
-        .read(&mut start)
-        .map_err(|error| Error::reading(path, &error))?;
-    let table = match Format::of(path, &start[..length]) {
-        Format::Parquet => parquet::read(path)?.table,
-        _ => csv::read_table(path)?,
-    };
-    table.mapped(mapping)?.into_recording()
+    table(path)?.mapped(mapping)?.into_recording()
+}
+
+/// The same without a look at its time. A log is refused by its name.
+pub fn table(path: &Path) -> Result<Table> {
+    let mut start = Vec::new();
+    let reading = |error: io::Error| Error::reading(path, &error);
+    let file = File::open(path).map_err(reading)?;
+    file.take(16).read_to_end(&mut start).map_err(reading)?;
+    let ending = path.extension().and_then(|ending| ending.to_str());
+    match Format::of(path, &start) {
+        Format::Parquet => parquet::read(path),
+        // An empty file is told by the reader of CSV, and a name of a column may begin as a log does.
+        Format::Csv => csv::read_table(path),
+        Format::Candump | Format::Asc if start.is_empty() || ending == Some("csv") => {
+            csv::read_table(path)
+        }
+        log => Err(Error::new(
+            Kind::Unsupported,
+            path.display().to_string(),
+            Place::default(),
+            format!("a log ({})", log.name()),
+            "a recording as CSV or Parquet: `twin convert` makes one of it",
+        )),
+    }
 }

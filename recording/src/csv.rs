@@ -1,4 +1,5 @@
-//! The canonical CSV: UTF-8, one header line, comma, decimal point, a row per line, an empty field for a missing value.
+//! The canonical CSV: UTF-8, one header line, comma, decimal point, a row per line, an empty field or NaN for a missing
+//! value. A column with anything else in it is left out.
 //!
 //! Lines are split here and not by a general CSV reader, because every message must name the line it is about.
 
@@ -14,7 +15,7 @@ use crate::{
     mapping::Mapping,
     output::{Columns, WholeFile},
     series::Recording,
-    table::{self, Table},
+    table::{self, LeftOut, Table},
 };
 
 /// Reads a recording.
@@ -51,7 +52,7 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
 
     // Lines are of about the same length.
     let expected_rows = text.len() / (header.len().max(names.len() * 4) + 1);
-    let mut columns = vec![Vec::with_capacity(expected_rows); names.len()];
+    let mut columns = vec![Ok(Vec::with_capacity(expected_rows)); names.len()];
     let mut line_numbers = table::Lines::default();
     for (row, (number, line)) in lines.enumerate() {
         let mut fields = Fields::new(line);
@@ -66,9 +67,16 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
                 )
             })?;
             let field = field.ok_or_else(|| unclosed(source, place()))?;
-            values.push(value(&field).map_err(|kind| {
-                fault(kind, place(), quoted(&field), "a number or an empty field")
-            })?);
+            let Ok(numbers) = values else {
+                continue;
+            };
+            match value(&field) {
+                Ok(number) => numbers.push(number),
+                Err(kind) => {
+                    let expected = "a number or an empty field";
+                    *values = Err(fault(kind, place(), quoted(&field), expected));
+                }
+            }
         }
         let more = fields.count();
         if more > 0 {
@@ -81,11 +89,22 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
         }
         line_numbers.push(row, number);
     }
-    Table::with_lines(
-        source,
-        names.into_iter().zip(columns).collect(),
-        line_numbers,
-    )
+    let (mut numbers, mut positions, mut left_out) = (Vec::new(), Vec::new(), Vec::new());
+    for (position, (name, values)) in names.into_iter().zip(columns).enumerate() {
+        match values {
+            Ok(values) => {
+                numbers.push((name, values));
+                positions.push(position);
+            }
+            Err(error) => left_out.push(LeftOut { name, error }),
+        }
+    }
+    // Not one column of numbers: this is no recording.
+    if let ([], Some(first)) = (numbers.as_slice(), left_out.first()) {
+        return Err(first.error.clone());
+    }
+    let table = Table::with_lines(source, numbers, line_numbers)?;
+    Ok(table.with_left_out(&positions, left_out))
 }
 
 /// The bytes as text, without a byte order mark.
@@ -173,16 +192,13 @@ fn unclosed(source: &str, place: Place) -> Error {
     )
 }
 
-/// A field's number, NaN for an empty one.
+/// A field's number, NaN for an empty one and for NaN, as other tools write what is missing.
 fn value(field: &str) -> std::result::Result<f64, Kind> {
     let field = field.trim_ascii();
     if field.is_empty() {
         return Ok(f64::NAN);
     }
     let number = field.parse::<f64>().map_err(|_| Kind::NotANumber)?;
-    if number.is_nan() {
-        return Err(Kind::NotANumber);
-    }
     if number.is_infinite() {
         return Err(Kind::Infinite);
     }
@@ -385,6 +401,11 @@ impl Writer {
     /// All rows are written: the file appears under its name.
     pub fn finish(self) -> Result<()> {
         self.file.finish()
+    }
+
+    /// All rows are written: the file, to get its name together with others.
+    pub fn into_file(self) -> WholeFile {
+        self.file
     }
 
     fn end_line(&mut self) -> Result<()> {

@@ -88,17 +88,25 @@ struct Bits {
 impl Bits {
     /// The raw bits, if the frame has them all.
     fn of(self, data: &[u8; DATA_BYTES], length: usize) -> Option<u64> {
-        let available = 8 * length as u64;
-        let mask = u64::MAX >> (64 - self.size);
-        if self.big_endian {
+        let first = if self.big_endian {
             // The start is the most significant bit; bytes are counted onwards, bits in them downwards.
-            let first = self.start / 8 * 8 + (7 - self.start % 8);
-            let end = first.checked_add(self.size)?;
-            (end <= available).then(|| (u64::from_be_bytes(*data) >> (64 - end)) & mask)
+            (self.start / 8).checked_mul(8)? + (7 - self.start % 8)
         } else {
-            let end = self.start.checked_add(self.size)?;
-            (end <= available).then(|| (u64::from_le_bytes(*data) >> self.start) & mask)
-        }
+            self.start
+        };
+        let end = usize::try_from(first.checked_add(self.size)?).ok()?;
+        // Up to nine bytes: 64 bits that begin in the middle of one.
+        let start = end - usize::try_from(self.size).ok()?;
+        let bytes = data.get(..length)?.get(start / 8..end.div_ceil(8))?;
+        let join = |word: u128, byte: &u8| word << 8 | u128::from(*byte);
+        let word = if self.big_endian {
+            bytes.iter().fold(0, join) >> (end.div_ceil(8) * 8 - end)
+        } else {
+            bytes.iter().rev().fold(0, join) >> (start % 8)
+        };
+        let mask = u64::MAX >> (64 - self.size);
+        #[expect(clippy::cast_possible_truncation, reason = "the mask is not wider")]
+        Some(word as u64 & mask)
     }
 }
 
@@ -424,6 +432,14 @@ impl<'a> Decoder<'a> {
             Error::new(kind, self.source.as_str(), place, found, expected)
         };
         let zero_ns = *self.zero_ns.get_or_insert(frame.time_ns);
+        // What another bus carries is nobody's concern.
+        if self.bus.as_ref().is_some_and(|bus| bus != frame.bus) {
+            if !self.others.contains(frame.bus) {
+                self.others.insert(frame.bus.to_owned());
+            }
+            return Ok(());
+        }
+        self.met = true;
         let time_ns = frame.time_ns.saturating_sub(zero_ns);
         if time_ns < self.latest_ns.saturating_sub(DISORDER_NS) {
             return Err(fault(
@@ -439,13 +455,6 @@ impl<'a> Decoder<'a> {
             self.counts.disordered += 1;
         }
         self.latest_ns = self.latest_ns.max(time_ns);
-        if self.bus.as_ref().is_some_and(|bus| bus != frame.bus) {
-            if !self.others.contains(frame.bus) {
-                self.others.insert(frame.bus.to_owned());
-            }
-            return Ok(());
-        }
-        self.met = true;
         let id = if frame.extended {
             MessageId::Extended(frame.id)
         } else {

@@ -42,6 +42,8 @@ pub enum Kind {
     Unsupported,
     /// A name mapping that cannot be followed.
     Mapping,
+    /// The file to be written is one that is read.
+    Overwrites,
 }
 
 /// Where in a file.
@@ -182,6 +184,11 @@ impl Error {
     /// The file that it is in.
     pub fn file(&self) -> &str {
         &self.0.file
+    }
+
+    /// What was found there.
+    pub fn found(&self) -> &str {
+        &self.0.found
     }
 
     /// Where in the file.

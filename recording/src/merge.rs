@@ -43,6 +43,8 @@ pub struct Merged {
     /// For each series, the row of each of its samples; increasing.
     rows: Vec<Vec<u32>>,
     columns: Vec<Column>,
+    /// What else the file has, and why it is not here.
+    left_out: Vec<String>,
 }
 
 #[derive(Clone, Debug)]
@@ -119,7 +121,14 @@ impl Merged {
             time_s: keys.into_iter().map(|(time_s, _)| time_s).collect(),
             rows,
             columns,
+            left_out: Vec::new(),
         })
+    }
+
+    /// With what else the file has, each as `name (reason)`: said if it is asked for.
+    #[must_use]
+    pub fn leaving_out(self, left_out: Vec<String>) -> Self {
+        Self { left_out, ..self }
     }
 
     /// With the names that `mapping` gives to columns, by their whole name or by the one before the unit's ending; a
@@ -188,6 +197,20 @@ impl Merged {
             .map(|index| (index, false))
             .or_else(|| negated().map(|index| (index, true)))
             .ok_or_else(|| {
+                let plain = wanted.strip_prefix('-').unwrap_or(wanted);
+                let there = self.left_out.iter().find(|left| {
+                    let rest = left.strip_prefix(plain);
+                    rest.is_some_and(|rest| rest.starts_with(" ("))
+                });
+                if let Some(left) = there {
+                    return Error::new(
+                        Kind::ColumnMissing,
+                        self.source.as_str(),
+                        Place::default(),
+                        left,
+                        format!("numbers in {}", quoted(plain)),
+                    );
+                }
                 let names: Vec<_> = self.columns.iter().map(|column| &*column.name).collect();
                 Error::new(
                     Kind::ColumnMissing,
@@ -225,7 +248,8 @@ impl Columns for Merged {
             let Some(place) = values.get_mut(row as usize - first) else {
                 break;
             };
-            *place = if column.negative { -value } else { value };
+            // Nothing is nothing in either direction.
+            *place = if column.negative { 0.0 - value } else { value };
         }
     }
 }

@@ -1,4 +1,5 @@
-//! Parquet with the columns of the canonical CSV: one flat column of numbers each, null for a missing value.
+//! Parquet with the columns of the canonical CSV: one flat column of numbers each, null or NaN for a missing value. A column
+//! of timestamps counts from its first one, in s.
 
 use std::{
     fs,
@@ -9,7 +10,7 @@ use std::{
 };
 
 use ::parquet::{
-    basic::{Compression, ConvertedType, LogicalType, Repetition, Type as Physical},
+    basic::{Compression, ConvertedType, LogicalType, Repetition, TimeUnit, Type as Physical},
     column::reader::{ColumnReader, ColumnReaderImpl},
     data_type::{DataType, DoubleType},
     errors::ParquetError,
@@ -26,29 +27,20 @@ use bytes::Bytes;
 use crate::{
     error::{Error, Kind, Place, Result, quoted},
     output::{Columns, WholeFile},
-    table::Table,
+    table::{LeftOut, Table},
 };
 
 /// Rows that are written, and read, at once.
 const GROUP: usize = 1 << 17;
 
-/// A table, and the columns that were left out because they hold no numbers.
-#[derive(Debug)]
-pub struct Contents {
-    /// The columns of numbers.
-    pub table: Table,
-    /// The others, with the reason.
-    pub left_out: Vec<String>,
-}
-
-/// Reads a table.
-pub fn read(path: &Path) -> Result<Contents> {
+/// Reads a table; columns that hold no numbers are left out.
+pub fn read(path: &Path) -> Result<Table> {
     let bytes = fs::read(path).map_err(|error| Error::reading(path, &error))?;
     parse(&path.display().to_string(), bytes)
 }
 
 /// Reads a table from memory; `source` is what messages call it.
-pub fn parse(source: &str, bytes: Vec<u8>) -> Result<Contents> {
+pub fn parse(source: &str, bytes: Vec<u8>) -> Result<Table> {
     // The crate panics at some damaged pages ("Decoder for dict should have been set"): that is an error of the file too.
     panic::catch_unwind(AssertUnwindSafe(|| parse_or_panic(source, bytes))).unwrap_or_else(|_| {
         Err(Error::new(
@@ -61,7 +53,7 @@ pub fn parse(source: &str, bytes: Vec<u8>) -> Result<Contents> {
     })
 }
 
-fn parse_or_panic(source: &str, bytes: Vec<u8>) -> Result<Contents> {
+fn parse_or_panic(source: &str, bytes: Vec<u8>) -> Result<Table> {
     let refused = |error: ParquetError| {
         let kind = match error {
             ParquetError::NYI(_) => Kind::Unsupported,
@@ -79,15 +71,26 @@ fn parse_or_panic(source: &str, bytes: Vec<u8>) -> Result<Contents> {
     let file = SerializedFileReader::new(Bytes::from(bytes)).map_err(refused)?;
     let schema = file.metadata().file_metadata().schema_descr();
     let mut columns: Vec<(String, Vec<f64>)> = Vec::new();
-    let mut left_out = Vec::new();
+    let (mut positions, mut left_out) = (Vec::new(), Vec::new());
     for index in 0..schema.num_columns() {
         let column = schema.column(index);
         let name = column.path().string();
-        let Some(kind) = number(&column) else {
-            left_out.push(format!("{name} ({:?})", column.physical_type()));
-            continue;
+        let kind = match number(&column) {
+            Ok(kind) => kind,
+            Err(other) => {
+                let place = Place {
+                    column: Some(index + 1),
+                    name: Some(name.clone()),
+                    ..Place::default()
+                };
+                let expected = "numbers: whole ones, float, double, booleans or timestamps";
+                let error = Error::new(Kind::Unsupported, source, place, other, expected);
+                left_out.push(LeftOut { name, error });
+                continue;
+            }
         };
         let mut values = Vec::new();
+        let mut origin = None;
         for group in 0..file.num_row_groups() {
             let group = file.get_row_group(group).map_err(refused)?;
             let chunk = group.metadata().column(index);
@@ -121,7 +124,7 @@ fn parse_or_panic(source: &str, bytes: Vec<u8>) -> Result<Contents> {
             }
             let reader = group.get_column_reader(index).map_err(refused)?;
             let rows = group.metadata().num_rows();
-            let read = column_values(reader, kind, &mut values).map_err(refused)?;
+            let read = column_values(reader, kind, &mut origin, &mut values).map_err(refused)?;
             if i64::try_from(read) != Ok(rows) {
                 return Err(Error::new(
                     Kind::FieldCount,
@@ -136,24 +139,25 @@ fn parse_or_panic(source: &str, bytes: Vec<u8>) -> Result<Contents> {
             }
         }
         if let Some(row) = values.iter().position(|value| value.is_infinite()) {
-            return Err(Error::new(
-                Kind::Infinite,
-                source,
-                Place {
-                    row: Some(row as u64 + 1),
-                    name: Some(name),
-                    ..Place::default()
-                },
-                "an infinite value",
-                "a number, or null for a missing one",
-            ));
+            let place = Place {
+                row: Some(row as u64 + 1),
+                column: Some(index + 1),
+                name: Some(name.clone()),
+                ..Place::default()
+            };
+            let expected = "a number, or null for a missing one";
+            let error = Error::new(Kind::Infinite, source, place, "an infinite value", expected);
+            left_out.push(LeftOut { name, error });
+            continue;
         }
         columns.push((name, values));
+        positions.push(index);
     }
-    Ok(Contents {
-        table: Table::new(source, columns)?,
-        left_out,
-    })
+    // Not one column of numbers: this is no recording.
+    if let ([], Some(first)) = (columns.as_slice(), left_out.first()) {
+        return Err(first.error.clone());
+    }
+    Ok(Table::new(source, columns)?.with_left_out(&positions, left_out))
 }
 
 /// Whether a column's piece lies inside of a file of `size` bytes: the reader takes that for granted.
@@ -176,16 +180,41 @@ enum Number {
     Plain,
     /// Whole numbers without a sign.
     Unsigned,
+    /// A moment, in so many parts of a second.
+    Moment(f64),
 }
 
-/// `None` for columns that hold something else, such as text, dates or lists.
-fn number(column: &ColumnDescriptor) -> Option<Number> {
-    if column.max_rep_level() > 0 || column.max_def_level() > 1 {
-        return None;
+/// How a column is read; what it holds, if that is something else, such as text, dates or lists.
+fn number(column: &ColumnDescriptor) -> std::result::Result<Number, String> {
+    if column.max_rep_level() > 0 {
+        return Err("a list".to_owned());
     }
+    if column.max_def_level() > 1 {
+        return Err("a part of a structure".to_owned());
+    }
+    flat_number(column).ok_or_else(|| match column.logical_type_ref() {
+        Some(LogicalType::String) => "text".to_owned(),
+        Some(LogicalType::Decimal(_)) => "decimals".to_owned(),
+        Some(LogicalType::Float16) => "numbers of the type float16".to_owned(),
+        Some(LogicalType::Date) => "dates".to_owned(),
+        Some(LogicalType::Time(_)) => "times of the day".to_owned(),
+        Some(LogicalType::Unknown) => "nothing but null".to_owned(),
+        _ => match (column.converted_type(), column.physical_type()) {
+            (ConvertedType::NONE, physical) => format!("values of the type {physical}"),
+            (converted, _) => format!("values of the type {converted}"),
+        },
+    })
+}
+
+fn flat_number(column: &ColumnDescriptor) -> Option<Number> {
     let whole = match (column.logical_type_ref(), column.converted_type()) {
         (Some(LogicalType::Integer(whole)), _) if whole.is_signed => Number::Plain,
         (Some(LogicalType::Integer(_)), _) => Number::Unsigned,
+        (Some(LogicalType::Timestamp(moment)), _) => Number::Moment(match moment.unit {
+            TimeUnit::MILLIS => 1e3,
+            TimeUnit::MICROS => 1e6,
+            TimeUnit::NANOS => 1e9,
+        }),
         (Some(_), _) => return None,
         (
             None,
@@ -202,6 +231,8 @@ fn number(column: &ColumnDescriptor) -> Option<Number> {
             | ConvertedType::UINT_32
             | ConvertedType::UINT_64,
         ) => Number::Unsigned,
+        (None, ConvertedType::TIMESTAMP_MILLIS) => Number::Moment(1e3),
+        (None, ConvertedType::TIMESTAMP_MICROS) => Number::Moment(1e6),
         _ => return None,
     };
     matches!(
@@ -211,15 +242,23 @@ fn number(column: &ColumnDescriptor) -> Option<Number> {
     .then_some(whole)
 }
 
-/// Appends a column's values, NaN for null, and says how many.
+/// Appends a column's values, NaN for null, and says how many. Moments count from `origin`, the first one: as a number of
+/// seconds since 1970 they would have few digits left.
 fn column_values(
     reader: ColumnReader,
     kind: Number,
+    origin: &mut Option<i64>,
     values: &mut Vec<f64>,
 ) -> std::result::Result<usize, ParquetError> {
     match (reader, kind) {
         (ColumnReader::BoolColumnReader(reader), _) => {
             append(reader, values, |&value| f64::from(u8::from(value)))
+        }
+        (ColumnReader::Int64ColumnReader(reader), Number::Moment(parts)) => {
+            append(reader, values, |&value| {
+                let since = i128::from(value) - i128::from(*origin.get_or_insert(value));
+                since as f64 / parts
+            })
         }
         (ColumnReader::Int32ColumnReader(reader), Number::Plain) => {
             append(reader, values, |&value| f64::from(value))
@@ -244,7 +283,7 @@ fn column_values(
 fn append<T: DataType>(
     mut reader: ColumnReaderImpl<T>,
     values: &mut Vec<f64>,
-    number: impl Fn(&T::T) -> f64,
+    mut number: impl FnMut(&T::T) -> f64,
 ) -> std::result::Result<usize, ParquetError> {
     let before = values.len();
     let (mut levels, mut present) = (Vec::new(), Vec::new());
@@ -255,7 +294,7 @@ fn append<T: DataType>(
         if rows == 0 {
             return Ok(values.len() - before);
         }
-        let mut present = present.iter().map(&number);
+        let mut present = present.iter().map(&mut number);
         if levels.is_empty() {
             values.extend(present);
         } else {

@@ -16,6 +16,16 @@ pub struct Table {
     columns: Vec<Column>,
     /// Empty if row `n` is simply row `n + 1` of its file.
     lines: Lines,
+    /// Columns of the file that hold no numbers.
+    left_out: Vec<LeftOut>,
+}
+
+/// A column that is in the file and cannot be read as numbers: no fault, unless somebody needs it.
+#[derive(Clone, Debug)]
+pub(crate) struct LeftOut {
+    pub name: String,
+    /// What to say then.
+    pub error: Error,
 }
 
 /// The line of each row, from 1. Rows mostly stand line by line: each run of such rows is held by its first row and that row's
@@ -115,7 +125,40 @@ impl Table {
             source,
             columns,
             lines,
+            left_out: Vec::new(),
         })
+    }
+
+    /// With what else the file has. `positions` are those of the columns in it, from 0.
+    pub(crate) fn with_left_out(mut self, positions: &[usize], left_out: Vec<LeftOut>) -> Self {
+        for (column, position) in self.columns.iter_mut().zip(positions) {
+            column.position = *position;
+        }
+        self.left_out = left_out;
+        self
+    }
+
+    /// Columns that are in the file but hold no numbers, each with the reason.
+    pub fn left_out(&self) -> Vec<String> {
+        let all = self.left_out.iter();
+        all.map(|left| {
+            let place = left.error.place();
+            let at = match (place.line, place.row) {
+                (Some(line), _) => format!(" in line {line}"),
+                (None, Some(row)) => format!(" in row {row}"),
+                _ => String::new(),
+            };
+            format!("{} ({}{at})", left.name, left.error.found())
+        })
+        .collect()
+    }
+
+    /// Refuses a table that has one of these columns, but without numbers. A column that is not there is no fault.
+    pub fn refuse_left_out<'a>(&self, names: impl IntoIterator<Item = &'a str>) -> Result<()> {
+        names
+            .into_iter()
+            .find_map(|name| self.left_out.iter().find(|left| left.name == name))
+            .map_or(Ok(()), |left| Err(left.error.clone()))
     }
 
     /// The file it came from, as messages name it.
@@ -192,7 +235,11 @@ impl Table {
                 ..column.clone()
             };
             if as_it_is.is_none() {
-                mapped.values.iter_mut().for_each(|value| *value = -*value);
+                // Nothing is nothing in either direction.
+                mapped
+                    .values
+                    .iter_mut()
+                    .for_each(|value| *value = 0.0 - *value);
             }
             taken.insert(column.name.clone());
             columns.push(mapped);
@@ -206,6 +253,8 @@ impl Table {
                 }),
         );
         columns.sort_by_key(|column| column.position);
+        self.left_out
+            .retain(|left| !named.contains(left.name.as_str()));
         self.columns = columns;
         Ok(self)
     }
@@ -220,6 +269,12 @@ impl Table {
     }
 
     fn lacks(&self, name: &str) -> Error {
+        let plain = name.strip_prefix('-').unwrap_or(name);
+        for name in [name, plain] {
+            if let Some(left) = self.left_out.iter().find(|left| left.name == name) {
+                return left.error.clone();
+            }
+        }
         Error::new(
             Kind::ColumnMissing,
             self.source.as_str(),

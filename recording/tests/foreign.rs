@@ -205,8 +205,11 @@ fn tables_of_any_type_of_number() {
         let converted =
             convert::read(&folder.join(&file), &Options::default(), &mut |_| {}).unwrap();
         assert_eq!(converted.format, Format::Parquet);
-        assert_eq!(converted.left_out, ["remark (BYTE_ARRAY)", "date (INT64)"]);
-        compare(&file, &samples(&table(&converted), 0.0), &theirs);
+        assert_eq!(converted.left_out, ["remark (text)"]);
+        let mut ours = samples(&table(&converted), 0.0);
+        // Moments count from the first one, theirs are dates.
+        assert_eq!(ours.remove("date").unwrap()[0].1, 0.0);
+        compare(&file, &ours, &theirs);
     }
 }
 

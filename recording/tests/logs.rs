@@ -89,8 +89,12 @@ fn candump_faults_have_their_place() {
             "log, line 2, column 3: found \"123\", expected a frame such as 123#DEADBEEF",
         ),
         (
-            "(1.0) can0 123##0AA",
-            "log, line 1: found a CAN FD frame, expected classic CAN frames",
+            "(1.0) can0 123##",
+            "log, line 1, column 3: found \"123##\", expected a digit of flags and up to 64 bytes of two hexadecimal digits after ##",
+        ),
+        (
+            "(1.0) can0 123##1A",
+            "log, line 1, column 3: found \"123##1A\", expected a digit of flags and up to 64 bytes of two hexadecimal digits after ##",
         ),
         (
             "(1.0) can0 1234#00",
@@ -225,7 +229,15 @@ fn vector_ascii_faults_have_their_place() {
         ),
         (
             "base hex\n0.1 CANFD 1 Rx 20 1 0 9 12 00",
-            "log, line 2: found a CAN FD frame, expected classic CAN frames",
+            "log, line 2, column 11: found \"\", expected a byte",
+        ),
+        (
+            "base hex\n0.1 CANFD 1 Rx 20 Name 1 0 f 65 00",
+            "log, line 2, column 10: found \"65\", expected a length of 0 to 64",
+        ),
+        (
+            "base hex\n0.1 CANFD 1 Rx 20 Name x 0 f 64 00",
+            "log, line 2, column 7: found \"x\", expected 0 or 1 for the bit rate switch",
         ),
     ];
     for (log, sentence) in cases {
@@ -267,10 +279,11 @@ fn vector_binary_faults_have_their_place() {
     let (frames, _) = read(BLF, &log(&object(100, &fd))).unwrap();
     assert_eq!(frames, [plain(5, "1", 0x123, &[0xAA, 0xBB])]);
     fd[13] = 1;
-    assert_eq!(
-        read(BLF, &log(&object(100, &fd))).unwrap_err().to_string(),
-        "log, byte 144: found a CAN FD frame, expected classic CAN frames"
-    );
+    fd[14] = 64;
+    fd[83] = 0xCC;
+    let (frames, counts) = read(BLF, &log(&object(100, &fd))).unwrap();
+    assert_eq!(frames, [plain(5, "1", 0x123, &fd[20..84])]);
+    assert_eq!((counts.frames, counts.fd), (1, 1));
 
     let whole = log(&object(1, &message));
     for (bytes, sentence) in [
@@ -300,6 +313,43 @@ fn vector_binary_faults_have_their_place() {
     ] {
         assert_eq!(read(BLF, &bytes).unwrap_err().to_string(), sentence);
     }
+}
+
+#[test]
+fn frames_of_can_fd_have_up_to_64_bytes() {
+    let bytes: Vec<u8> = (0..64).collect();
+    let hex = |join: &str| {
+        let digits: Vec<String> = bytes.iter().map(|byte| format!("{byte:02X}")).collect();
+        digits.join(join)
+    };
+    let log = format!(
+        "(1.5) can0 123##1{}\n(1.6) can0 12345678##0\n(1.7) can0 123##5AA.BB\n",
+        hex("")
+    );
+    let (frames, counts) = read(CANDUMP, log.as_bytes()).unwrap();
+    let expected = |bus: &str| {
+        [
+            plain(1_500_000_000, bus, 0x123, &bytes),
+            plain(1_600_000_000, bus, -0x1234_5678, &[]),
+            plain(1_700_000_000, bus, 0x123, &[0xAA, 0xBB]),
+        ]
+    };
+    assert_eq!(frames, expected("can0"));
+    assert_eq!((counts.frames, counts.fd), (3, 3));
+
+    let tail = "0 0 1000 0 0 0 0 0";
+    let log = format!(
+        "base hex timestamps absolute\n1.5 CANFD 1 Rx 123 Shunt 1 0 f 64 {} {tail}\n\
+         1.6 CANFD 1 Tx 12345678x 0 0 0 0 {tail}\n1.7 CANFD 1 Rx 123 1 0 2 2 AA BB\n\
+         1.8 CANFD 1 Rx 123 0 0 2 0 0 0 10 0\n1.9 CANFD 1 Rx ErrorFrame\n",
+        hex(" ")
+    );
+    let (frames, counts) = read(ASC, log.as_bytes()).unwrap();
+    assert_eq!(frames, expected("1"));
+    assert_eq!(
+        (counts.frames, counts.fd, counts.remote, counts.errors),
+        (3, 3, 1, 1)
+    );
 }
 
 const DATABASE: &str = r#"VERSION ""
@@ -418,6 +468,11 @@ fn of_two_buses_one_must_be_chosen() {
     );
     let (read, _) = decode_with(DATABASE, log, Some("can1")).unwrap();
     assert_eq!(column(&read, "Shunt.Current_a"), [0.002]);
+    // Another bus may do what it likes: CAN FD, and a clock that was set.
+    let log = "(9.0) can0 010##1000102030405060708090A0B\n(1.1) can1 010#0200\n";
+    let (read, decoded) = decode_with(DATABASE, log, Some("can1")).unwrap();
+    assert_eq!(column(&read, "Shunt.Current_a"), [0.002]);
+    assert_eq!((decoded.frames, decoded.unknown), (1, 0));
 }
 
 #[test]
@@ -562,6 +617,8 @@ fn any_log() -> impl Strategy<Value = Vec<u8>> {
     let pieces = prop::sample::select(vec![
         "(1.5) can0 ",
         "123#",
+        "123##1",
+        "CANFD 1 Rx 20 1 0 2 2 ",
         "0011",
         "\n",
         "#",
@@ -597,29 +654,27 @@ fn any_log() -> impl Strategy<Value = Vec<u8>> {
 proptest! {
     #[test]
     fn bits_are_those_of_the_definition(
-        data: [u8; 8],
+        data in prop::collection::vec(any::<u8>(), DATA_BYTES),
         big_endian: bool,
-        start in 0_u64..70,
+        start in 0_u64..520,
         size in 1_u64..=64,
-        length in 0_usize..=8,
+        length in prop::sample::select(vec![0_usize, 1, 5, 8, 12, 48, 64, 64]),
     ) {
         let order = if big_endian { 0 } else { 1 };
         let database = format!(
-            "VERSION \"\"\n\nBU_: A\n\nBO_ 16 M: 8 A\n SG_ S : {start}|{size}@{order}+ (1,0) [0|0] \"\" A\n"
+            "VERSION \"\"\n\nBU_: A\n\nBO_ 16 M: 64 A\n SG_ S : {start}|{size}@{order}+ (1,0) [0|0] \"\" A\n"
         );
         let database = Database::parse("v.dbc", database.as_bytes()).unwrap();
         let mut decoder = Decoder::new(&database, "log", None, true);
-        let mut kept = [0; 8];
+        let mut kept = [0; DATA_BYTES];
         kept[..length].copy_from_slice(&data[..length]);
         decoder.frame(&Frame {
             time_ns: 0, bus: "0", id: 16, extended: false, length, data: kept, place: Default::default(),
         }).unwrap();
         let (series, decoded) = decoder.finish().unwrap();
         let value = series[0].signals[0].values[0];
-        let mut short = [0; 8];
-        short.copy_from_slice(&kept);
         let last_byte = |bit: u64| bit / 8 < length as u64;
-        let expected = raw_by_definition(&short, big_endian, start, size).filter(|_| {
+        let expected = raw_by_definition(&kept, big_endian, start, size).filter(|_| {
             // All its bytes were sent.
             if big_endian { last_byte((start / 8) * 8 + (7 - start % 8) + size - 1) } else { last_byte(start + size - 1) }
         });

@@ -81,11 +81,14 @@ const UNSIGNED: u32 = 0;
 const FLOAT: u32 = 4;
 const BYTES: u32 = 10;
 
+/// What CAN FD can carry.
+const LONG: [u8; 64] = [0xA5; 64];
+
 /// Logged frames whose data stand in a group of values of variable length, their records mixed with those of measured
 /// voltages, as the loggers on a vehicle write them.
 fn mixed() -> Vec<u8> {
     let mut maker = Maker::new();
-    let values = maker.group(0, 0, [2, 3, 1, 0]);
+    let values = maker.group(0, 0, [2, 4, 1, 0]);
 
     let data = maker.channel(
         0,
@@ -111,7 +114,7 @@ fn mixed() -> Vec<u8> {
     let id = maker.channel(ide, 0, "CAN_DataFrame.ID", 0, [FIXED, 0, UNSIGNED, 8, 16]);
     let frame = maker.channel(0, id, "CAN_DataFrame", 0, [FIXED, 0, BYTES, 8, 96]);
     let time = maker.channel(frame, 0, "Timestamp", 0, [MASTER, 1, FLOAT, 0, 64]);
-    let frames = maker.group(values, time, [1, 3, 2, 20]);
+    let frames = maker.group(values, time, [1, 4, 2, 20]);
 
     let voltage = maker.channel(0, 0, "v_cell_v", 0, [FIXED, 0, FLOAT, 8, 32]);
     let time = maker.channel(voltage, 0, "t", 0, [MASTER, 1, FLOAT, 0, 64]);
@@ -139,6 +142,7 @@ fn mixed() -> Vec<u8> {
     voltage(&mut records, 0.5, 3.5);
     frame(&mut records, 0.5, 0x123, 1, &[]);
     frame(&mut records, 0.75, 0x7FF, 0, &[1, 2, 3, 4, 5, 6, 7, 8]);
+    frame(&mut records, 1.0, 0x7FF, 0, &LONG);
     voltage(&mut records, 1.5, 3.25);
 
     let data = maker.block("DT", &[], &records);
@@ -164,8 +168,10 @@ fn mixed_groups_and_values_of_variable_length() {
             (250_000_000, 0x123, false, vec![1, 2, 3]),
             (500_000_000, 0x123, true, vec![]),
             (750_000_000, 0x7FF, false, vec![1, 2, 3, 4, 5, 6, 7, 8]),
+            (1_000_000_000, 0x7FF, false, LONG.to_vec()),
         ]
     );
+    assert_eq!((contents.counts.frames, contents.counts.fd), (4, 1));
     assert_eq!(contents.series.len(), 1);
     assert_eq!(contents.series[0].time_s, [0.5, 1.5]);
     assert_eq!(contents.series[0].signals[0].name, "v_cell_v");
@@ -196,6 +202,20 @@ fn groups_tell_equal_names_apart() {
         .map(|series| &series.signals[0].name)
         .collect();
     assert_eq!(names, ["group 1.x", "group 2.x"]);
+}
+
+#[test]
+fn an_infinite_value_is_no_value_of_a_recording() {
+    let mut records = [[0; 20]; 3];
+    for (record, value) in records.iter_mut().zip([1.0, f32::NAN, f32::INFINITY]) {
+        record[8..12].copy_from_slice(&value.to_le_bytes());
+    }
+    let contents = mdf::read("m.mf4", &measured(8, 0, 32, FLOAT, &records)).unwrap();
+    let why = "x (an infinite value in record 3)";
+    assert_eq!(contents.left_out, [why, why]);
+    // What is not a number is missing.
+    let contents = mdf::read("m.mf4", &measured(8, 0, 32, FLOAT, &records[..2])).unwrap();
+    assert!(contents.series[0].signals[0].values[1].is_nan());
 }
 
 #[test]
@@ -248,6 +268,47 @@ fn what_is_not_read_is_said() {
         assert_eq!(error.kind(), kind);
         assert!(error.to_string().ends_with(sentence), "{error}");
     }
+}
+
+/// Each level of compositions links the whole level below from each of its channels: 8^9 channels in 12 kB.
+#[test]
+fn channels_that_share_their_members_are_damage() {
+    let mut maker = Maker::new();
+    let mut members = 0;
+    for _ in 0..9 {
+        let mut next = 0;
+        for _ in 0..8 {
+            next = maker.channel(next, members, "", 0, [FIXED, 0, UNSIGNED, 0, 8]);
+        }
+        members = next;
+    }
+    let group = maker.group(0, members, [0, 1, 0, 8]);
+    let data = maker.block("DT", &[], &[0; 8]);
+    let data_group = maker.block("DG", &[0, group, data, 0], &[0; 8]);
+    let error = mdf::read("m.mf4", &maker.finish(data_group)).unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .ends_with("found channels that are linked again and again, expected each once"),
+        "{error}"
+    );
+}
+
+#[test]
+fn data_that_is_listed_twice_is_damage() {
+    let mut maker = Maker::new();
+    let time = maker.channel(0, 0, "t", 0, [MASTER, 1, FLOAT, 0, 64]);
+    let group = maker.group(0, time, [0, 2, 0, 8]);
+    let data = maker.block("DT", &[], &[0; 8]);
+    let list = maker.block("DL", &[0, data, data], &[0; 16]);
+    let data_group = maker.block("DG", &[0, group, list, 0], &[0; 8]);
+    let error = mdf::read("m.mf4", &maker.finish(data_group)).unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .ends_with("found a block twice in a list of data, expected each block once"),
+        "{error}"
+    );
 }
 
 #[test]

@@ -95,6 +95,66 @@ fn what_is_no_number_is_placed() {
     );
 }
 
+/// A file with columns of types that others write.
+fn of_other_types(path: &std::path::Path) {
+    use ::parquet::{
+        data_type::{ByteArray, ByteArrayType, Int32Type, Int64Type},
+        file::writer::SerializedFileWriter,
+        schema::parser::parse_message_type,
+    };
+    let schema = "message m {
+        required int64 when (TIMESTAMP(MICROS,true));
+        required binary i_meas_a (STRING);
+        required int32 volts (DECIMAL(9,2));
+    }";
+    let schema = std::sync::Arc::new(parse_message_type(schema).unwrap());
+    let file = fs::File::create(path).unwrap();
+    let mut writer = SerializedFileWriter::new(file, schema, Default::default()).unwrap();
+    let mut group = writer.next_row_group().unwrap();
+    let times = [1_700_000_000_000_001_i64, 1_700_000_000_250_001];
+    let mut column = group.next_column().unwrap().unwrap();
+    let typed = column.typed::<Int64Type>();
+    typed.write_batch(&times, None, None).unwrap();
+    column.close().unwrap();
+    let mut column = group.next_column().unwrap().unwrap();
+    let typed = column.typed::<ByteArrayType>();
+    let texts = ["1", "2"].map(ByteArray::from);
+    typed.write_batch(&texts, None, None).unwrap();
+    column.close().unwrap();
+    let mut column = group.next_column().unwrap().unwrap();
+    let typed = column.typed::<Int32Type>();
+    typed.write_batch(&[1, 2], None, None).unwrap();
+    column.close().unwrap();
+    group.close().unwrap();
+    writer.close().unwrap();
+}
+
+#[test]
+fn columns_of_other_types_are_there_but_of_no_use() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("r.parquet");
+    of_other_types(&path);
+    let table = parquet::read(&path).unwrap();
+    assert_eq!(table.left_out(), ["i_meas_a (text)", "volts (decimals)"]);
+    for (name, found) in [
+        (
+            "i_meas_a",
+            "column 2 (i_meas_a): found text, expected numbers",
+        ),
+        (
+            "volts",
+            "column 3 (volts): found decimals, expected numbers",
+        ),
+    ] {
+        let error = table.need(name).unwrap_err().to_string();
+        assert!(error.contains(found), "{error}");
+    }
+    // Moments count from the first one, to the last digit.
+    let mapping = Mapping::parse(["t_s=when"]).unwrap();
+    let read = convert::recording(&path, &mapping).unwrap();
+    assert_eq!(read.time_s(), [0.0, 0.25]);
+}
+
 proptest! {
     #[test]
     fn what_is_written_is_read_bit_by_bit(rows in prop::collection::vec((any_number(), any_number()), 1..50)) {
@@ -103,9 +163,9 @@ proptest! {
         let path = folder.path().join("out.parquet");
         parquet::write(&path, &table, &mut |_| {}).unwrap();
         let read = parquet::read(&path).unwrap();
-        prop_assert!(read.left_out.is_empty());
-        prop_assert!(table.names().eq(read.table.names()));
-        for ((_, ours), (_, theirs)) in table.columns().zip(read.table.columns()) {
+        prop_assert!(read.left_out().is_empty());
+        prop_assert!(table.names().eq(read.names()));
+        for ((_, ours), (_, theirs)) in table.columns().zip(read.columns()) {
             prop_assert_eq!(bits(ours), bits(theirs));
         }
     }
@@ -127,7 +187,7 @@ proptest! {
             bytes.truncate(cut.index(bytes.len()));
         }
         match parquet::parse("r.parquet", bytes) {
-            Ok(read) => prop_assert!(read.table.columns().all(|(_, values)| values.len() == read.table.len())),
+            Ok(read) => prop_assert!(read.columns().all(|(_, values)| values.len() == read.len())),
             Err(error) => prop_assert!(error.to_string().starts_with("r.parquet")),
         }
     }

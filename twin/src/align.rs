@@ -18,6 +18,8 @@ const STANDS_OUT: f64 = 6.0;
 const SCAN_CORRELATION: f64 = 0.6;
 /// Fastest clock error that is looked for, in 1: crystals are within 100 ppm, cheap loggers within 500.
 const FASTEST_RATE: f64 = 500e-6;
+/// No clock is that wrong, in 1: it is another unit of time, or another file.
+const WRONG_RATE: f64 = 0.02;
 /// Readings that the fine fit uses at most.
 const FIT_ROWS: usize = 20_000;
 /// Beyond this share of the signal's spread a residual counts in proportion and not squared.
@@ -190,6 +192,14 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
         return Err(nothing_in_common(driven, sensed));
     }
     let rate = fine.drift_s / fit.span_s;
+    if rate.abs() > WRONG_RATE {
+        return Err(format!(
+            "found clocks that differ in rate by {:.1} %, expected less than {:.0} %: the unit of time of one file is likely \
+             wrong (t_s is in s), or they are not of the same run",
+            100.0 * rate.abs(),
+            100.0 * WRONG_RATE
+        ));
+    }
     Ok(Alignment {
         offset_s: fine.offset_s,
         fast_ppm: (1.0 / (1.0 + rate) - 1.0) * 1e6,

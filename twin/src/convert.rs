@@ -7,9 +7,10 @@ use recording::{
     Mapping,
     convert::{self, Converted, Options},
     dbc::Database,
+    output,
 };
 
-use crate::{failure::Failure, overwrite, progress::Progress};
+use crate::{failure::Failure, progress::Progress};
 
 /// What an example of its use looks like.
 const EXAMPLE: &str = "\
@@ -45,13 +46,14 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     let database = arguments.dbc.as_deref().map(|path| ("--dbc", path));
     let read = [("IN", arguments.input.as_path())];
-    overwrite::refuse(&arguments.out, read.into_iter().chain(database))?;
+    output::refuse_overwrite(&arguments.out, read.into_iter().chain(database))?;
     let options = Options {
         database: arguments.dbc.as_deref().map(Database::read).transpose()?,
         bus: arguments.bus.clone(),
         mapping: Mapping::parse(arguments.map.iter().map(String::as_str))?,
     };
     convert::is_parquet(&arguments.out)?;
+    output::check(&arguments.out)?;
     let mut reading = Progress::new(format!("reading {}", arguments.input.display()));
     let converted = convert::read(&arguments.input, &options, &mut |share| reading.at(share))?;
     drop(reading);
@@ -83,6 +85,7 @@ fn summary(arguments: &Arguments, converted: &Converted) -> String {
             (decoded.unknown, "not in the DBC"),
             (decoded.short, "too short for a signal"),
             (decoded.disordered, "put in order of time"),
+            (counts.fd, "CAN FD frames in the log"),
             (counts.remote, "remote frames"),
             (counts.errors, "error frames"),
             (counts.others, "other events"),

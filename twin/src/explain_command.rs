@@ -3,20 +3,22 @@
 mod calibration;
 
 use std::{
-    collections::HashSet,
+    collections::HashMap,
     fs,
     io::Write,
     path::{Path, PathBuf},
 };
 
 use clap::Args;
-use recording::{Error, output::WholeFile};
+use recording::{
+    Error,
+    output::{self, Folder, WholeFile},
+};
 
 use crate::{
     explain::{self, Holdout, Options},
     failure::Failure,
     model::{Found, Model, Shift, registry},
-    overwrite,
     prepare::{Inputs, Item, Prepared, Purpose, prepare},
     progress::Progress,
     report::{
@@ -45,6 +47,10 @@ const FILES: [&str; 4] = [
 const COPIED: f64 = 0.9;
 /// So many of them are compared.
 const COMPARED: usize = 10_000;
+/// Times of a copy may have been written anew, with another origin and fewer digits: that much they may differ by, in s.
+const REWRITTEN_S: f64 = 1e-3;
+/// Pairs of equal readings that are looked at to find the origin.
+const ORIGIN_PAIRS: usize = 1_000_000;
 /// Width of the summary where the terminal does not tell its own.
 const WIDTH: usize = 100;
 
@@ -103,14 +109,19 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     read.extend(reference.map(|path| ("--reference", path.as_path())));
     let holdout = arguments.holdout.iter();
     read.extend(holdout.map(|path| ("--holdout", path.as_path())));
-    let refuse = |read: &[(&str, &Path)]| {
+    let refuse = |read: &[(&str, &Path)]| -> recording::Result<()> {
         FILES
             .iter()
-            .try_for_each(|name| overwrite::refuse(&out.join(name), read.iter().copied()))
+            .try_for_each(|name| output::refuse_overwrite(&out.join(name), read.iter().copied()))
     };
     refuse(&read)?;
     let model = Model::read(&arguments.model)?;
     refuse(model.ocv_file().as_slice())?;
+    // Whether it can be written is not found out after the work.
+    let folder = Folder::make(out)?;
+    for name in FILES {
+        output::check(&out.join(name))?;
+    }
     let reading = Progress::new(format!("reading {}", arguments.recording.display()));
     let inputs = Inputs {
         recording: arguments.recording.clone(),
@@ -126,7 +137,8 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             reference: None,
             mapping: arguments.map.clone(),
         };
-        let other = prepare(&model, &inputs, Purpose::Compare)?;
+        let other = prepare(&model, &inputs, Purpose::Compare)
+            .map_err(|failure| without_reference(failure, arguments.reference.is_some()))?;
         if let Some(signal) = copied(&prepared, &other) {
             return Err(Failure::Input(format!(
                 "{}, column {signal}: found the readings of {}, expected another recording: a hold-out is never fitted",
@@ -180,7 +192,7 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     if let Some(text) = calibration.text {
         files.push((registers, text));
     }
-    write(out, &files)?;
+    write(&folder, &files)?;
     let width = std::env::var("COLUMNS")
         .ok()
         .and_then(|width| width.parse().ok());
@@ -189,23 +201,81 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
         .to_owned())
 }
 
-/// The first signal of a hold-out whose readings are those of the fitted recording, at the same times of their own clocks.
+/// A hold-out that lacks the column of the reference, while the recording has its own in a file beside it.
+fn without_reference(failure: Failure, beside: bool) -> Failure {
+    match failure {
+        Failure::Input(text) if beside && text.contains("expected a column") => {
+            Failure::Input(format!(
+                "{text}: --reference belongs to --recording alone, a hold-out has its reference in a column of its own"
+            ))
+        }
+        other => other,
+    }
+}
+
+/// The first signal of a hold-out whose readings are those of the fitted recording at the same times, from whatever origin.
 /// Only those that differ from the one before are looked at: at rest two recordings may read the same.
 fn copied(fitted: &Prepared, other: &Prepared) -> Option<String> {
     other.items.iter().find_map(|item| {
         let name = &item.problem.name;
         let same = fitted.items.iter().find(|one| one.problem.name == *name)?;
         let every = changes(other, item).count().div_ceil(COMPARED).max(1);
-        let some: HashSet<(u64, u64)> = changes(other, item).step_by(every).collect();
-        let shared: HashSet<(u64, u64)> = changes(fitted, same)
-            .filter(|change| some.contains(change))
-            .collect();
-        (shared.len() as f64 > COPIED * some.len() as f64).then(|| name.clone())
+        let some: Vec<(f64, u64)> = changes(other, item).step_by(every).collect();
+        let mut known: HashMap<u64, Vec<f64>> = HashMap::new();
+        for (t_s, value) in changes(fitted, same) {
+            known.entry(value).or_default().push(t_s);
+        }
+        for times in known.values_mut() {
+            times.sort_by(f64::total_cmp);
+        }
+        let is_there = |t_s: f64, value: u64| {
+            known.get(&value).is_some_and(|times| {
+                let at = times.partition_point(|known_s| *known_s < t_s - REWRITTEN_S);
+                times
+                    .get(at)
+                    .is_some_and(|known_s| *known_s <= t_s + REWRITTEN_S)
+            })
+        };
+        let is_copy = |origin_s: f64| {
+            let shared = some
+                .iter()
+                .filter(|(t_s, value)| is_there(t_s + origin_s, *value));
+            shared.count() as f64 > COPIED * some.len() as f64
+        };
+        origins(&some, &known)
+            .into_iter()
+            .any(is_copy)
+            .then(|| name.clone())
     })
 }
 
-/// Time and value, to the last digit, of each reading that differs from the one before.
-fn changes<'a>(prepared: &'a Prepared, item: &'a Item) -> impl Iterator<Item = (u64, u64)> + 'a {
+/// What has to be added to the times of these readings so that most of them are those that are known: nothing, or one of the
+/// most frequent differences of time between equal readings.
+fn origins(some: &[(f64, u64)], known: &HashMap<u64, Vec<f64>>) -> Vec<f64> {
+    const TRIED: usize = 3;
+    const LEAST: usize = 20;
+    let all: usize = known.values().map(Vec::len).sum();
+    let each = (all / known.len().max(1)).max(1);
+    let taken = (ORIGIN_PAIRS / each).max(LEAST);
+    let every = some.len().div_ceil(taken).max(1);
+    let mut votes: HashMap<i64, (usize, f64)> = HashMap::new();
+    for (t_s, value) in some.iter().step_by(every) {
+        for known_s in known.get(value).into_iter().flatten() {
+            let origin_s = known_s - t_s;
+            #[expect(clippy::cast_possible_truncation, reason = "saturates")]
+            let cell = (origin_s / REWRITTEN_S).round() as i64;
+            votes.entry(cell).or_insert((0, origin_s)).0 += 1;
+        }
+    }
+    let mut most: Vec<(usize, f64)> = votes.into_values().collect();
+    // The same order each time.
+    most.sort_by(|one, other| other.0.cmp(&one.0).then(one.1.total_cmp(&other.1)));
+    let most = most.into_iter().take(TRIED).map(|(_, origin_s)| origin_s);
+    std::iter::once(0.0).chain(most).collect()
+}
+
+/// Time, and value to the last digit, of each reading that differs from the one before.
+fn changes<'a>(prepared: &'a Prepared, item: &'a Item) -> impl Iterator<Item = (f64, u64)> + 'a {
     let observed = &item.problem.observed;
     let mut last = f64::NAN;
     (0..observed.value.len())
@@ -215,34 +285,23 @@ fn changes<'a>(prepared: &'a Prepared, item: &'a Item) -> impl Iterator<Item = (
         })
         .filter_map(|row| {
             let t_s = prepared.t_s.get(*item.rows.get(row)?)?;
-            Some((t_s.to_bits(), observed.value[row].to_bits()))
+            Some((*t_s, observed.value[row].to_bits()))
         })
 }
 
 /// All files, or none.
-fn write(folder: &Path, files: &[(&str, String)]) -> Result<(), Failure> {
-    let is_new = !folder.exists();
-    fs::create_dir_all(folder).map_err(|error| Error::writing(folder, &error))?;
-    let written = (|| {
-        let mut finished = Vec::new();
-        for (name, content) in files {
-            let path = folder.join(name);
-            let mut file = WholeFile::create(&path)?;
-            file.write_all(content.as_bytes())
-                .map_err(|error| Error::writing(&path, &error))?;
-            finished.push(file);
-        }
-        finished.into_iter().try_for_each(WholeFile::finish)
-    })();
-    if let Err(error) = written {
-        if is_new {
-            // Empty, or not ours any more.
-            let _ = fs::remove_dir(folder);
-        }
-        return Err(error.into());
+fn write(folder: &Folder, files: &[(&str, String)]) -> Result<(), Failure> {
+    let mut finished = Vec::new();
+    for (name, content) in files {
+        let path = folder.path().join(name);
+        let mut file = WholeFile::create(&path)?;
+        file.write_all(content.as_bytes())
+            .map_err(|error| Error::writing(&path, &error))?;
+        finished.push(file);
     }
+    output::finish_all(finished)?;
     // One that an earlier run has left would not belong to this report.
-    let calibration = folder.join("calibration.toml");
+    let calibration = folder.path().join("calibration.toml");
     if files.iter().all(|(name, _)| *name != "calibration.toml") && calibration.exists() {
         fs::remove_file(&calibration).map_err(|error| Error::writing(&calibration, &error))?;
     }

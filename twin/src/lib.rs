@@ -8,7 +8,6 @@ pub mod explain;
 pub mod explain_command;
 pub mod failure;
 pub mod model;
-pub mod overwrite;
 pub mod prepare;
 pub mod problem;
 pub mod progress;

@@ -1,6 +1,6 @@
 //! The command line of `twin`: exit code 0 done, 1 the check asked for failed, 2 bad input.
 
-use std::io::Write as _;
+use std::io::{self, IsTerminal as _, Write as _};
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
@@ -24,18 +24,56 @@ enum Command {
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
-    match run(&arguments.command) {
-        Ok(summary) => {
-            if !summary.is_empty() {
-                // A reader that has seen enough (`| head`) is no failure.
-                let _ = writeln!(std::io::stdout(), "{summary}");
-            }
-            ExitCode::SUCCESS
-        }
+    #[cfg(unix)]
+    if let Err(error) = leave_nothing() {
+        eprintln!("error: listening for Ctrl-C: {error}");
+        return ExitCode::from(2);
+    }
+    match run(&arguments.command).and_then(|summary| say(&summary)) {
+        Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
             eprintln!("error: {failure}");
             failure.exit_code()
         }
+    }
+}
+
+/// Ctrl-C and a request to end leave no unfinished file behind.
+#[cfg(unix)]
+fn leave_nothing() -> io::Result<()> {
+    use signal_hook::{
+        consts::{SIGINT, SIGTERM},
+        iterator::Signals,
+    };
+    let mut signals = Signals::new([SIGINT, SIGTERM])?;
+    std::thread::spawn(move || {
+        if let Some(signal) = signals.forever().next() {
+            recording::output::abandon();
+            // The line of the progress goes.
+            let clear = if io::stderr().is_terminal() {
+                "\r\x1b[K"
+            } else {
+                ""
+            };
+            eprintln!("{clear}error: interrupted: nothing was written");
+            // What a shell makes of a signal.
+            std::process::exit(128 + signal);
+        }
+    });
+    Ok(())
+}
+
+fn say(summary: &str) -> Result<(), Failure> {
+    if summary.is_empty() {
+        return Ok(());
+    }
+    let mut out = io::stdout();
+    match writeln!(out, "{summary}").and_then(|()| out.flush()) {
+        // A reader that has seen enough (`| head`) is no failure.
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Failure::Input(format!(
+            "standard output: found \"{error}\" from the system, expected a place that can be written"
+        ))),
+        _ => Ok(()),
     }
 }
 

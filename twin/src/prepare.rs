@@ -33,6 +33,16 @@ pub const FEWEST_ROWS: usize = 50;
 /// Columns of a reference and of the sensor beside it, in the order in which they are looked for.
 const PAIRS: [(&str, &str); 2] = [("i_ref_a", "i_meas_a"), ("p_ref_w", "p_meas_w")];
 
+/// Columns of what surrounds the sensor and the battery.
+const SURROUNDINGS: [&str; 6] = [
+    "temp_sensor_c",
+    "v_supply_v",
+    "i_aux_a",
+    "range_high",
+    "temp_cell_c",
+    "temp_ambient_c",
+];
+
 /// What is read.
 #[derive(Clone, Debug, Default)]
 pub struct Inputs {
@@ -131,6 +141,17 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
         remarks: Vec::new(),
         clock: None,
     };
+    for frame in [Some(&frame), reference.as_ref()].into_iter().flatten() {
+        checks::time_goes_on(frame)?;
+        let left_out = frame.left_out();
+        if !left_out.is_empty() {
+            work.remark(format!(
+                "columns of {} without numbers are left out: {}",
+                frame.source(),
+                left_out.join(", ")
+            ));
+        }
+    }
     let mut items = Vec::new();
     if let Some(sensor) = &model.sensor {
         items.extend(work.sensor(sensor)?);
@@ -547,15 +568,7 @@ impl<'a> Work<'a> {
             let values = self.frame.column(name)?;
             series::held_at(clock, values, &drive.t_s).map(Series::from)
         };
-        let surroundings = [
-            "temp_sensor_c",
-            "v_supply_v",
-            "i_aux_a",
-            "range_high",
-            "temp_cell_c",
-            "temp_ambient_c",
-        ]
-        .map(held);
+        let surroundings = SURROUNDINGS.map(held);
         [
             drive.sensor_temperature_c,
             drive.supply_v,

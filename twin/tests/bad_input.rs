@@ -92,6 +92,193 @@ fn two_units() {
 }
 
 #[test]
+fn text_where_numbers_are_needed() {
+    // A note is nobody's concern, what the model uses is.
+    let noted = |name: &str| {
+        format!("t_s,i_ref_a,i_meas_a,{name}\n")
+            + &rows(300, |t| {
+                format!("{t},{},{},on", current(t), current(t) + 0.5)
+            })
+    };
+    says(
+        &explained(PAIR, &noted("temp_sensor_c")),
+        &["r.csv, line 2, column 4 (temp_sensor_c): found \"on\""],
+    );
+    let text = good().replacen(&format!("{}", current(0.0)), "1,0 A", 1);
+    assert!(text.contains("1,0 A"));
+    says(&explained(PAIR, &text), &["r.csv, line 2"]);
+}
+
+#[test]
+fn a_time_that_stands_still() {
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| format!("5,{},{}", current(t), current(t) + 0.5));
+    says(
+        &explained(PAIR, &recording),
+        &["r.csv, column t_s", "found 5 in every row", "goes on"],
+    );
+}
+
+#[test]
+fn a_clock_that_no_clock_is() {
+    let recorded = |kind: &str| {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/gpu-power-sensor");
+        fs::read_to_string(folder.join(format!("rtx3090-5050-{kind}.csv"))).unwrap()
+    };
+    // The reference's time in ms.
+    let reference = recorded("reference");
+    let (header, lines) = reference.split_once('\n').unwrap();
+    let mut in_ms = format!("{header}\n");
+    for line in lines.lines() {
+        let (t_s, rest) = line.split_once(',').unwrap();
+        let t_ms = 1000.0 * t_s.parse::<f64>().unwrap();
+        in_ms.push_str(&format!("{t_ms},{rest}\n"));
+    }
+    let sentence = refused(
+        &[
+            ("m.toml", PAIR),
+            ("r.csv", &recorded("sensor")),
+            ("ref.csv", &in_ms),
+        ],
+        &[
+            "explain",
+            "--model",
+            "m.toml",
+            "--recording",
+            "r.csv",
+            "--reference",
+            "ref.csv",
+            "--out",
+            "out",
+        ],
+    );
+    says(
+        &sentence,
+        &[
+            "ref.csv and r.csv",
+            "clocks that differ in rate by",
+            "unit of time",
+        ],
+    );
+}
+
+#[test]
+fn a_reference_that_is_loosely_opposite() {
+    // Half of the reading is something else: its sign alone is not what is wrong.
+    let other = |t: f64| 9.0 * (0.83 * t + 1.0).sin();
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| {
+            format!("{t},{},{}", current(t), other(t) - current(t))
+        });
+    let sentence = explained(PAIR, &recording);
+    says(&sentence, &["r.csv", "only loosely", "of the same run"]);
+    assert!(!sentence.contains("--map"), "{sentence}");
+}
+
+/// Something that does not repeat itself.
+fn slow(t: f64) -> f64 {
+    let steps = [3.0, -2.0, 7.0, 0.5, -6.0, 9.0, 1.0, -4.0, 5.0, 2.5];
+    steps[(t / 7.3) as usize % 10] + 4.0 * (0.0009 * t * t).sin() + (0.37 * t).sin()
+}
+
+#[test]
+fn a_log_is_no_recording_yet() {
+    for (name, content) in [
+        ("x.mf4", "MDF     4.10    "),
+        ("x.blf", "LOGG"),
+        ("x.log", "(1436509052.249713) can0 123#00\n"),
+        ("x.asc", "date Fri\nbase hex\n"),
+    ] {
+        let sentence = refused(
+            &[("m.toml", PAIR), (name, content)],
+            &[
+                "explain",
+                "--model",
+                "m.toml",
+                "--recording",
+                name,
+                "--out",
+                "out",
+            ],
+        );
+        says(&sentence, &[name, "found a log", "twin convert"]);
+    }
+}
+
+#[test]
+fn a_place_that_cannot_be_written_is_known_before_the_work() {
+    // What is read first has a fault too: the place is looked at before.
+    for (command, out, part) in [
+        ("simulate", "no/such/x.csv", "no folder \"no/such\""),
+        ("explain", "m.toml/out", "m.toml/out"),
+    ] {
+        let sentence = refused(
+            &[("m.toml", PAIR), ("r.csv", "bad")],
+            &[
+                command,
+                "--model",
+                "m.toml",
+                "--recording",
+                "r.csv",
+                "--out",
+                out,
+            ],
+        );
+        says(&sentence, &[part]);
+        assert!(!sentence.contains(".part"), "{sentence}");
+    }
+}
+
+#[test]
+fn a_hold_out_needs_its_own_reference() {
+    let sensor = "t_s,i_meas_a\n".to_owned() + &rows(3000, |t| format!("{t},{}", slow(t) + 0.5));
+    let reference = "t_s,i_ref_a\n".to_owned() + &rows(3000, |t| format!("{t},{}", slow(t)));
+    let sentence = refused(
+        &[
+            ("m.toml", PAIR),
+            ("r.csv", &sensor),
+            ("ref.csv", &reference),
+            ("other.csv", &sensor),
+        ],
+        &[
+            "explain",
+            "--model",
+            "m.toml",
+            "--recording",
+            "r.csv",
+            "--reference",
+            "ref.csv",
+            "--holdout",
+            "other.csv",
+            "--out",
+            "out",
+        ],
+    );
+    says(
+        &sentence,
+        &[
+            "other.csv",
+            "i_ref_a",
+            "--reference belongs to --recording alone",
+        ],
+    );
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_full_disk_behind_the_standard_output() {
+    let full = || fs::File::options().write(true).open("/dev/full").unwrap();
+    let output = Command::new(env!("CARGO_BIN_EXE_twin"))
+        .arg("effects")
+        .stdout(full())
+        .output()
+        .unwrap();
+    let sentence = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(2), "{sentence}");
+    says(&sentence, &["error: standard output: found"]);
+}
+
+#[test]
 fn opposite_signs() {
     let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
         + &rows(300, |t| format!("{t},{},{}", current(t), -current(t)));
@@ -434,6 +621,17 @@ fn a_hold_out_that_was_fitted() {
             "readings of r.csv",
             "never fitted",
         ],
+    );
+    // Its clock counts from elsewhere, and it was written with fewer digits.
+    let origin = 1.7e9;
+    let shifted = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| {
+            format!("{:.3},{},{}", t + origin, current(t), current(t) + 0.5)
+        });
+    let files = [("m.toml", PAIR), ("r.csv", &good()), ("copy.csv", &shifted)];
+    says(
+        &refused(&files, &[&arguments[..], &holdout].concat()),
+        &["copy.csv, column i_meas_a", "readings of r.csv"],
     );
     // Of the same drive, read anew.
     let other = "t_s,i_ref_a,i_meas_a\n".to_owned()

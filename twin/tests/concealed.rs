@@ -701,6 +701,10 @@ fn a_constant_in_slow_noise_is_constant() {
             .collect();
         let mut problem = problem_of(&truth, value, Coloured::default());
         problem.noise = stated;
-        assert_named(&said(problem, seed, &[]), "offset", &[("offset_a", 2.0, 0.3)]);
+        assert_named(
+            &said(problem, seed, &[]),
+            "offset",
+            &[("offset_a", 2.0, 0.3)],
+        );
     }
 }

@@ -171,6 +171,87 @@ fn bad_input_ends_with_2_and_leaves_nothing() {
 }
 
 #[test]
+fn what_a_mapping_replaces_is_said() {
+    let folder = folder();
+    fs::write(
+        folder.path().join("both.csv"),
+        "t_s,i_ref_a,i_meas_a,note\n0,1,0,x\n1,2,4,y\n",
+    )
+    .unwrap();
+    let output = twin(
+        folder.path(),
+        &[
+            "convert",
+            "both.csv",
+            "--out",
+            "out.csv",
+            "--map",
+            "i_ref_a=-i_meas_a",
+        ],
+    );
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    let said = text(&output.stdout);
+    assert!(
+        said.contains("left out: note (\"x\" in line 2), i_ref_a (i_meas_a has its name now)"),
+        "{said}"
+    );
+    let out = fs::read_to_string(folder.path().join("out.csv")).unwrap();
+    assert_eq!(out, "t_s,i_ref_a\n0,0\n1,-4\n");
+}
+
+#[test]
+fn an_empty_file_is_no_log() {
+    let folder = folder();
+    fs::write(folder.path().join("empty.log"), "").unwrap();
+    let output = twin(
+        folder.path(),
+        &["convert", "empty.log", "--dbc", "v.dbc", "--out", "out.csv"],
+    );
+    assert_eq!(output.status.code(), Some(2));
+    let said = text(&output.stderr);
+    assert!(
+        said.contains("empty.log: found an empty file, expected a log or a recording"),
+        "{said}"
+    );
+}
+
+#[cfg(unix)]
+#[test]
+fn an_interrupted_conversion_leaves_nothing() {
+    let folder = folder();
+    let mut long = "t_s,i_ref_a\n".to_owned();
+    for row in 0..1_500_000 {
+        long.push_str(&format!("{row},{}.25\n", row % 97));
+    }
+    fs::write(folder.path().join("long.csv"), long).unwrap();
+    for (signal, code) in [("-INT", 130), ("-TERM", 143)] {
+        let before = fs::read_dir(folder.path()).unwrap().count();
+        let mut twin = Command::new(env!("CARGO_BIN_EXE_twin"))
+            .args(["convert", "long.csv", "--out", "out.csv"])
+            .current_dir(folder.path())
+            .stderr(std::process::Stdio::null())
+            .spawn()
+            .unwrap();
+        let started = || {
+            fs::read_dir(folder.path()).unwrap().any(|entry| {
+                // Once there is something in it: that it can be made is tried at the start.
+                let entry = entry.unwrap();
+                let name = entry.file_name().into_string().unwrap();
+                name.ends_with(".part") && entry.metadata().is_ok_and(|there| there.len() > 0)
+            })
+        };
+        while !started() {
+            assert!(twin.try_wait().unwrap().is_none(), "it ended by itself");
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+        let id = twin.id().to_string();
+        Command::new("kill").args([signal, &id]).status().unwrap();
+        assert_eq!(twin.wait().unwrap().code(), Some(code));
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), before);
+    }
+}
+
+#[test]
 fn help_has_an_example_and_wrong_arguments_end_with_2() {
     let folder = folder();
     let help = twin(folder.path(), &["convert", "--help"]);

@@ -3,7 +3,7 @@
 
 use std::io::BufRead;
 
-use super::{Counts, DATA_BYTES, Frame, Lines, Sink, fd, fits, seconds_to_ns};
+use super::{CLASSIC_BYTES, Counts, DATA_BYTES, Frame, Lines, Sink, fits, seconds_to_ns};
 use crate::error::{Error, Kind, Place, Result, quoted};
 
 /// Reads a log; times count from the start of its measurement.
@@ -51,8 +51,10 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
                 extended,
                 length,
                 data,
+                fd,
             } => {
                 counts.frames += 1;
+                counts.fd += u64::from(fd);
                 sink(&Frame {
                     time_ns,
                     bus,
@@ -120,6 +122,7 @@ enum Read<'a> {
         extended: bool,
         length: usize,
         data: [u8; DATA_BYTES],
+        fd: bool,
     },
     Remote,
     Error,
@@ -135,7 +138,7 @@ impl<'a> Event<'a> {
     fn frame(&mut self, radix: u32) -> Result<Read<'a>> {
         let bus = self.next();
         if bus == "CANFD" {
-            return self.fd_frame();
+            return self.fd_frame(radix);
         }
         if !bus.bytes().all(|byte| byte.is_ascii_digit()) {
             return Ok(Read::Other);
@@ -150,16 +153,7 @@ impl<'a> Event<'a> {
             // Statistics, transmit requests, transport protocols.
             return Ok(Read::Other);
         }
-        let (digits, extended) = match identifier.strip_suffix(['x', 'X']) {
-            Some(digits) => (digits, true),
-            None => (identifier, false),
-        };
-        let id = number(digits, radix)
-            .filter(|&id| fits(id, extended))
-            .ok_or_else(|| {
-                self.field = id_field;
-                self.fault(identifier, "an identifier of 11 bits, or of 29 and an x")
-            })?;
+        let (id, extended) = self.identifier(identifier, id_field, radix)?;
         let kind = self.next();
         if kind.eq_ignore_ascii_case("r") {
             return Ok(Read::Remote);
@@ -171,14 +165,46 @@ impl<'a> Event<'a> {
         // Codes 9 to 15 stand for eight bytes as well (ISO 11898-1).
         let length = number(code, radix)
             .filter(|&code| code <= 15)
-            .map(|code| (code as usize).min(DATA_BYTES))
+            .map(|code| (code as usize).min(CLASSIC_BYTES))
             .ok_or_else(|| self.fault(code, "a length code of 0 to 15"))?;
-        let mut data = [0; DATA_BYTES];
-        for byte in &mut data[..length] {
-            let text = self.next();
-            *byte = number(text, radix)
-                .and_then(|value| u8::try_from(value).ok())
-                .ok_or_else(|| self.fault(text, "a byte"))?;
+        let data = self.data(length, radix)?;
+        Ok(Read::Data {
+            bus,
+            id,
+            extended,
+            length,
+            data,
+            fd: false,
+        })
+    }
+
+    /// `0.1 CANFD 1 Rx 123 Name 1 0 9 12 …`: the name may be left out; then two flags, length code and length, data,
+    /// duration, length in bits and flags.
+    fn fd_frame(&mut self, radix: u32) -> Result<Read<'a>> {
+        const REMOTE: u32 = 0x10;
+        const FD: u32 = 0x1000;
+        let (bus, _direction, identifier) = (self.next(), self.next(), self.next());
+        if identifier.eq_ignore_ascii_case("errorframe") {
+            return Ok(Read::Error);
+        }
+        let (id, extended) = self.identifier(identifier, self.field, radix)?;
+        if !matches!(self.next(), "0" | "1") {
+            let switched = self.next();
+            if !matches!(switched, "0" | "1") {
+                return Err(self.fault(switched, "0 or 1 for the bit rate switch"));
+            }
+        }
+        let (_indicator, _code) = (self.next(), self.next());
+        let text = self.next();
+        let length = number(text, 10)
+            .and_then(|length| usize::try_from(length).ok())
+            .filter(|&length| length <= DATA_BYTES)
+            .ok_or_else(|| self.fault(text, "a length of 0 to 64"))?;
+        let data = self.data(length, radix)?;
+        let (_duration, _bits) = (self.next(), self.next());
+        let flags = number(self.next(), 16);
+        if flags.is_some_and(|flags| flags & REMOTE != 0) {
+            return Ok(Read::Remote);
         }
         Ok(Read::Data {
             bus,
@@ -186,15 +212,32 @@ impl<'a> Event<'a> {
             extended,
             length,
             data,
+            fd: flags.is_none_or(|flags| flags & FD != 0) || length > CLASSIC_BYTES,
         })
     }
 
-    fn fd_frame(&mut self) -> Result<Read<'a>> {
-        let (_bus, _direction, identifier) = (self.next(), self.next(), self.next());
-        if identifier.eq_ignore_ascii_case("errorframe") {
-            return Ok(Read::Error);
+    fn identifier(&mut self, text: &str, field: usize, radix: u32) -> Result<(u32, bool)> {
+        let (digits, extended) = match text.strip_suffix(['x', 'X']) {
+            Some(digits) => (digits, true),
+            None => (text, false),
+        };
+        let id = number(digits, radix).filter(|&id| fits(id, extended));
+        let id = id.ok_or_else(|| {
+            self.field = field;
+            self.fault(text, "an identifier of 11 bits, or of 29 and an x")
+        })?;
+        Ok((id, extended))
+    }
+
+    fn data(&mut self, length: usize, radix: u32) -> Result<[u8; DATA_BYTES]> {
+        let mut data = [0; DATA_BYTES];
+        for byte in &mut data[..length] {
+            let text = self.next();
+            *byte = number(text, radix)
+                .and_then(|value| u8::try_from(value).ok())
+                .ok_or_else(|| self.fault(text, "a byte"))?;
         }
-        Err(fd(self.source, Place::line(self.number)))
+        Ok(data)
     }
 
     fn fault(&self, found: &str, expected: &str) -> Error {

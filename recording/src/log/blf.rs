@@ -8,7 +8,7 @@ use std::io::{self, BufRead, Read};
 
 use flate2::bufread::ZlibDecoder;
 
-use super::{Counts, DATA_BYTES, Frame, Sink, fd, fits, reading};
+use super::{CLASSIC_BYTES, Counts, DATA_BYTES, Frame, Sink, fits, reading};
 use crate::error::{Error, Kind, Place, Result, quoted};
 
 const FILE_MARK: &[u8; 4] = b"LOGG";
@@ -253,9 +253,6 @@ impl Objects<'_> {
             .ok_or_else(|| self.fault(offset, "a time beyond 292 years", "a time in a log"))?;
 
         let message = message(kind, body).ok_or_else(short)?;
-        if message.fd {
-            return Err(fd(self.source, Place::offset(offset)));
-        }
         let extended = message.id >> 31 != 0;
         let id = message.id & 0x7FFF_FFFF;
         if !fits(id, extended) {
@@ -270,12 +267,18 @@ impl Objects<'_> {
             return Ok(());
         }
         let mut data = [0; DATA_BYTES];
-        let length = message.length.min(DATA_BYTES);
+        let most = if message.fd {
+            DATA_BYTES
+        } else {
+            CLASSIC_BYTES
+        };
+        let length = message.length.min(most);
         let bytes = body
             .get(message.data..message.data + length)
             .ok_or_else(short)?;
         data[..length].copy_from_slice(bytes);
         self.counts.frames += 1;
+        self.counts.fd += u64::from(message.fd);
         self.bus = message.channel.to_string();
         sink(&Frame {
             time_ns,

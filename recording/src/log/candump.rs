@@ -1,9 +1,10 @@
 //! The log format of `candump -L` (can-utils, `log2asc.c` and `lib.c` read the same):
-//! `(1436509052.249713) can0 123#DEADBEEF`, a direction `R` or `T` may follow.
+//! `(1436509052.249713) can0 123#DEADBEEF`, a direction `R` or `T` may follow. A CAN FD frame has a second `#` and one
+//! digit of flags before its data: `123##1DEADBEEF`.
 
 use std::io::BufRead;
 
-use super::{Counts, DATA_BYTES, Frame, Lines, Sink, fd, fits, seconds_to_ns};
+use super::{CLASSIC_BYTES, Counts, DATA_BYTES, Frame, Lines, Sink, fits, seconds_to_ns};
 use crate::error::{Error, Kind, Place, Result, quoted};
 
 /// Set in the identifier of an error frame (`CAN_ERR_FLAG` of linux/can.h).
@@ -45,9 +46,6 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
         let (id, data) = frame
             .split_once('#')
             .ok_or_else(|| wrong("a frame such as 123#DEADBEEF"))?;
-        if data.starts_with('#') {
-            return Err(fd(source, Place::line(number)));
-        }
         let extended = id.len() == 8;
         let id = id
             .bytes()
@@ -63,6 +61,7 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
         if !fits(id, extended) {
             return Err(wrong("an identifier of 11 or 29 bits"));
         }
+        let fd = data.strip_prefix('#');
         if let Some(length) = data.strip_prefix(['R', 'r']) {
             // The length that was asked for may follow, and a raw length code after `_`.
             if !length
@@ -74,9 +73,18 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
             counts.remote += 1;
             continue;
         }
-        let (bytes, length) = bytes(data)
-            .ok_or_else(|| wrong("up to eight bytes of two hexadecimal digits after #"))?;
+        let (bytes, length) = match fd {
+            Some(data) => data
+                .strip_prefix(|flags: char| flags.is_ascii_hexdigit())
+                .and_then(|data| bytes(data, DATA_BYTES))
+                .ok_or_else(|| {
+                    wrong("a digit of flags and up to 64 bytes of two hexadecimal digits after ##")
+                })?,
+            None => classic(data)
+                .ok_or_else(|| wrong("up to eight bytes of two hexadecimal digits after #"))?,
+        };
         counts.frames += 1;
+        counts.fd += u64::from(fd.is_some());
         sink(&Frame {
             time_ns,
             bus,
@@ -90,8 +98,8 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
     Ok(counts)
 }
 
-/// The data: `DE.AD` is the same as `DEAD`; a raw length code `_9` … `_F` may follow eight bytes.
-fn bytes(text: &str) -> Option<([u8; DATA_BYTES], usize)> {
+/// Classic data: a raw length code `_9` … `_F` may follow eight bytes.
+fn classic(text: &str) -> Option<([u8; DATA_BYTES], usize)> {
     let digits = match text.split_once('_') {
         Some((digits, code)) => {
             let valid = matches!(code.as_bytes(), [b'9' | b'A'..=b'F' | b'a'..=b'f']);
@@ -99,6 +107,11 @@ fn bytes(text: &str) -> Option<([u8; DATA_BYTES], usize)> {
         }
         None => text,
     };
+    bytes(digits, CLASSIC_BYTES)
+}
+
+/// The data: `DE.AD` is the same as `DEAD`.
+fn bytes(digits: &str, most: usize) -> Option<([u8; DATA_BYTES], usize)> {
     let mut data = [0; DATA_BYTES];
     let mut length = 0;
     let mut rest = digits;
@@ -107,7 +120,7 @@ fn bytes(text: &str) -> Option<([u8; DATA_BYTES], usize)> {
         if !pair.bytes().all(|byte| byte.is_ascii_hexdigit()) {
             return None;
         }
-        *data.get_mut(length)? = u8::from_str_radix(pair, 16).ok()?;
+        *data[..most].get_mut(length)? = u8::from_str_radix(pair, 16).ok()?;
         length += 1;
         rest = &rest[2..];
         rest = match rest.strip_prefix('.') {

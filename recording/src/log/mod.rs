@@ -9,7 +9,9 @@ pub mod blf;
 pub mod candump;
 
 /// Bytes of a classic CAN frame at most.
-pub const DATA_BYTES: usize = 8;
+pub const CLASSIC_BYTES: usize = 8;
+/// Bytes of a CAN FD frame at most.
+pub const DATA_BYTES: usize = 64;
 
 /// A data frame of a log.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -35,6 +37,8 @@ pub struct Frame<'a> {
 pub struct Counts {
     /// Data frames.
     pub frames: u64,
+    /// Of those, CAN FD frames.
+    pub fd: u64,
     /// Error frames.
     pub errors: u64,
     /// Remote frames.
@@ -124,15 +128,19 @@ fn seconds_to_ns(text: &str) -> Option<i64> {
     Some(if negative { -ns } else { ns })
 }
 
-/// A CAN FD frame has been met.
-pub(crate) fn fd(source: &str, place: Place) -> Error {
-    Error::new(
-        Kind::Unsupported,
-        source,
-        place,
-        "a CAN FD frame",
-        "classic CAN frames",
-    )
+/// The number of data bytes that a length code stands for (ISO 11898-1).
+pub(crate) fn length_of_code(code: usize, fd: bool) -> usize {
+    match code {
+        ..=8 => code,
+        9 if fd => 12,
+        10 if fd => 16,
+        11 if fd => 20,
+        12 if fd => 24,
+        13 if fd => 32,
+        14 if fd => 48,
+        _ if fd => DATA_BYTES,
+        _ => CLASSIC_BYTES,
+    }
 }
 
 /// Whether an identifier fits its format.

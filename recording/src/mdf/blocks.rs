@@ -2,6 +2,8 @@
 
 use std::{
     borrow::Cow,
+    cell::Cell,
+    collections::HashSet,
     io::{self, Read},
 };
 
@@ -15,10 +17,11 @@ const HEADER: usize = 24;
 const LARGEST_RATIO: u64 = 1_032;
 
 /// The whole file.
-#[derive(Clone, Copy)]
 pub struct File<'a> {
     pub source: &'a str,
     pub bytes: &'a [u8],
+    /// Channels read so far.
+    pub channels: Cell<usize>,
 }
 
 /// A block: its links, and the data after them.
@@ -105,6 +108,20 @@ impl<'a> File<'a> {
         Ok(blocks)
     }
 
+    /// One more channel is read. A damaged file can link one chain from many places, and chains of those again: then there
+    /// are more than it has room for.
+    pub fn count_channel(&self, address: u64) -> Result<()> {
+        self.channels.set(self.channels.get() + 1);
+        if self.channels.get() <= self.bytes.len() / HEADER {
+            return Ok(());
+        }
+        Err(self.fault(
+            address,
+            "channels that are linked again and again",
+            "each once",
+        ))
+    }
+
     /// The text of a TX block, or the text inside an MD block's XML.
     pub fn text(&self, address: Option<u64>) -> Result<String> {
         let Some(address) = address else {
@@ -145,8 +162,16 @@ impl<'a> File<'a> {
 
     fn list(&self, first: Option<u64>) -> Result<Vec<u8>> {
         let mut data = Vec::new();
+        let mut met = HashSet::new();
         for list in self.chain(first, b"DL")? {
             for address in (1..list.links()).filter_map(|index| list.link(index)) {
+                if !met.insert(address) {
+                    return Err(self.fault(
+                        address,
+                        "a block twice in a list of data",
+                        "each block once",
+                    ));
+                }
                 let block = self.block(address)?;
                 match &block.id {
                     b"DT" | b"SD" => data.extend_from_slice(block.data),

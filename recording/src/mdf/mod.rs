@@ -8,14 +8,14 @@
 mod blocks;
 mod conversion;
 
-use std::{borrow::Cow, collections::HashMap, rc::Rc};
+use std::{borrow::Cow, cell::Cell, collections::HashMap, rc::Rc};
 
 use blocks::{Block, File, u16_at, u32_at, u64_at};
 use conversion::Conversion;
 
 use crate::{
     error::{Error, Kind, Place, Result, quoted},
-    log::{self, Counts, DATA_BYTES, Frame, Sink},
+    log::{self, CLASSIC_BYTES, Counts, DATA_BYTES, Frame, Sink},
     merge::{Series, Signal},
     unit::{self, Unit},
 };
@@ -77,7 +77,11 @@ impl Frames {
 
 /// Reads a file from memory; `source` is what messages call it. Times count from the start of its measurement.
 pub fn read(source: &str, bytes: &[u8]) -> Result<Contents> {
-    let file = File { source, bytes };
+    let file = File {
+        source,
+        bytes,
+        channels: Cell::new(0),
+    };
     if bytes.starts_with(b"UnFinMF ") {
         return Err(file.unsupported(0, "a measurement that was not ended", "a finished file"));
     }
@@ -281,7 +285,10 @@ impl<'a> Channel<'a> {
     fn all(file: &File<'a>, first: Option<u64>, depth: u32) -> Result<Vec<Self>> {
         file.chain(first, b"CN")?
             .into_iter()
-            .map(|block| Self::read(file, block, depth))
+            .map(|block| {
+                file.count_channel(block.address)?;
+                Self::read(file, block, depth)
+            })
             .collect()
     }
 
@@ -445,11 +452,21 @@ impl Group<'_> {
                 contents.left_out.push(why);
                 continue;
             };
+            let values = self.values(file, channel, &rule)?;
+            if let Some(record) = values.iter().position(|value| value.is_infinite()) {
+                let why = format!(
+                    "{} (an infinite value in record {})",
+                    channel.name,
+                    record + 1
+                );
+                contents.left_out.push(why);
+                continue;
+            }
             signals.push(Signal {
                 name: unit::column_name(&channel.name, unit),
                 bare: channel.name.clone(),
                 unit: unit.map(|unit| unit.symbol),
-                values: self.values(file, channel, &rule)?,
+                values,
             });
         }
         if !signals.is_empty() {
@@ -482,10 +499,8 @@ impl Group<'_> {
                 let raw = channel
                     .raw(record, index)
                     .ok_or_else(|| outside(file, channel))?;
-                let value = rule.apply(raw);
-                // What a recording cannot carry is missing in it.
-                let valid = value.is_finite() && !channel.invalid(inval);
-                Ok(if valid { value } else { f64::NAN })
+                let valid = !channel.invalid(inval);
+                Ok(if valid { rule.apply(raw) } else { f64::NAN })
             })
             .collect()
     }
@@ -518,7 +533,7 @@ impl Group<'_> {
             let fault = |kind, found: String, expected: String| {
                 Err(Error::new(kind, file.source, place(), found, expected))
             };
-            if now_s.is_nan() {
+            if !now_s.is_finite() {
                 return fault(Kind::TimeMissing, "no time".into(), "a time in s".into());
             }
             if now_s < last_s {
@@ -561,7 +576,8 @@ impl Group<'_> {
             })
         };
         let (id, bytes) = (need("ID")?, need("DataBytes")?);
-        let length = member("DataLength").map_or_else(|| need("DLC"), Ok)?;
+        let counted = member("DataLength");
+        let length = counted.map_or_else(|| need("DLC"), Ok)?;
         let (ide, edl, bus) = (member("IDE"), member("EDL"), member("BusChannel"));
         let payload = Payload::of(file, bytes, &self.variable)?;
         let number = |channel: &Channel<'_>, record: &[u8]| {
@@ -573,10 +589,23 @@ impl Group<'_> {
         };
         for (index, ((record, _), &time_s)) in self.records().zip(time_s).enumerate() {
             let place = || Place::row(index as u64 + 1);
-            let length = usize::try_from(number(length, record)?).unwrap_or(usize::MAX);
-            if optional(edl, record)? != 0 || length > DATA_BYTES {
-                return Err(log::fd(file.source, place()));
+            let fd = optional(edl, record)? != 0;
+            let said = usize::try_from(number(length, record)?).unwrap_or(usize::MAX);
+            let length = if counted.is_some() {
+                said
+            } else {
+                log::length_of_code(said, fd)
+            };
+            if length > DATA_BYTES {
+                return Err(Error::new(
+                    Kind::Format,
+                    file.source,
+                    place(),
+                    format!("a frame of {length} bytes"),
+                    "at most 64",
+                ));
             }
+            contents.counts.fd += u64::from(fd || length > CLASSIC_BYTES);
             let raw = number(id, record)?;
             // Some loggers mark 29 bits in the identifier itself.
             let extended = optional(ide, record)? != 0 || raw >> 31 & 1 != 0;

@@ -1,6 +1,6 @@
 //! What cannot be explained because the input is not what it is said to be: each its own clear error.
 
-use super::{FEWEST_ROWS, battery::PACK, seconds, series::median};
+use super::{FEWEST_ROWS, Frame, battery::PACK, seconds, series::median};
 use crate::{
     failure::Failure,
     model::Sensor,
@@ -12,6 +12,8 @@ use crate::{
 const POWER_WITHIN: f64 = 2.0;
 /// Below this correlation with its reference a sensor counts the other way round.
 const OPPOSITE: f64 = -0.5;
+/// Of one and the same current it is below this.
+const SURELY_OPPOSITE: f64 = -0.8;
 /// Below this magnitude of correlation the two have nothing in common.
 const UNRELATED: f64 = 0.1;
 /// A voltage further than this beyond the table's ends, as a factor, is not that of so many cells.
@@ -48,6 +50,20 @@ pub(super) fn not_constant(values: &[f64], name: &str, source: &str) -> Result<(
     Err(Failure::Input(format!(
         "{source}, column {name}: found {first} in every row, expected a signal that moves"
     )))
+}
+
+/// Time goes on.
+pub(super) fn time_goes_on(frame: &Frame) -> Result<(), Failure> {
+    let t_s = frame.t_s();
+    let moves = t_s.windows(2).any(|pair| pair[0] != pair[1]);
+    match t_s.first() {
+        Some(first) if !moves && t_s.len() > 1 => Err(Failure::Input(format!(
+            "{}, column {}: found {first} in every row, expected a time in s that goes on",
+            frame.source(),
+            frame.origin("t_s")
+        ))),
+        _ => Ok(()),
+    }
 }
 
 /// There is enough to say something.
@@ -296,6 +312,12 @@ pub(super) fn pair(
         )));
     }
     let together = correlation(pairs);
+    if (SURELY_OPPOSITE..OPPOSITE).contains(&together) {
+        return Err(Failure::Input(format!(
+            "{source}: {measured} falls where {reference} rises, but only loosely (correlation {together:.2}): found two signals \
+             that are hardly of the same run, expected a sensor and its reference"
+        )));
+    }
     if together < OPPOSITE {
         return Err(Failure::Input(format!(
             "{source}: {measured} falls where {reference} rises (correlation {together:.2}): found opposite signs, expected \

@@ -1,10 +1,10 @@
 //! A recording under the names of the model file, with its signs.
 
-use std::{fs::File, io::Read, ops::Range, path::Path};
+use std::ops::Range;
 
-use recording::{Error, Mapping, Recording, Table, convert::Format, csv, parquet};
+use recording::{Mapping, Recording, Table, convert};
 
-use super::Inputs;
+use super::{Inputs, PAIRS, SURROUNDINGS};
 use crate::{failure::Failure, model::Model};
 
 /// A recording as the model file and `--map` want it seen.
@@ -57,6 +57,37 @@ impl Frame {
         Ok(self.recording.need(name)?)
     }
 
+    /// Columns that are in the file and hold no numbers, each with the reason.
+    pub fn left_out(&self) -> Vec<String> {
+        self.recording.table().left_out()
+    }
+
+    /// A column that would be compared or used if it held numbers is not just left out.
+    fn refuse_left_out(&self, model: &Model) -> Result<(), Failure> {
+        let mut used = vec!["cycle"];
+        if let Some(sensor) = &model.sensor {
+            let stated = [sensor.reference.as_deref(), sensor.measured.as_deref()];
+            used.extend(stated.into_iter().flatten());
+            if sensor.reference.is_none() || sensor.measured.is_none() {
+                used.extend(PAIRS.iter().flat_map(|(one, other)| [*one, *other]));
+            }
+            let charge = model.charge.as_ref();
+            let counter = charge.and_then(|charge| charge.column.as_deref());
+            used.push(counter.unwrap_or("q_meas_c"));
+            used.extend(SURROUNDINGS);
+        }
+        if let Some(battery) = &model.battery {
+            let current = ["i_ref_a", "i_meas_a"];
+            match &battery.current {
+                Some(stated) => used.push(stated),
+                None => used.extend(current),
+            }
+            used.extend(["soc_pct", "v_cell_v", "v_pack_v", "ah_meas_ah"]);
+            used.extend(SURROUNDINGS);
+        }
+        Ok(self.recording.table().refuse_left_out(used)?)
+    }
+
     /// Time of each row in s.
     pub fn t_s(&self) -> &[f64] {
         self.recording.time_s()
@@ -81,11 +112,13 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
             wanted.push((name.clone(), column.clone()));
         }
     }
-    let recording = table(&inputs.recording)?;
+    let recording = convert::table(&inputs.recording)?;
     let Some(reference) = &inputs.reference else {
-        return Ok((mapped(recording, &wanted)?, None));
+        let frame = mapped(recording, &wanted)?;
+        frame.refuse_left_out(model)?;
+        return Ok((frame, None));
     };
-    let reference = table(reference)?;
+    let reference = convert::table(reference)?;
     // Each name belongs to the file that has its column; to the recording if both do.
     let (to_reference, rest): (Vec<_>, Vec<_>) = wanted.into_iter().partition(|(name, column)| {
         let has = |table: &Table| {
@@ -103,25 +136,10 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
         .into_iter()
         .filter(|(_, column)| reference.column(column).is_some());
     let to_reference: Vec<_> = to_reference.into_iter().chain(time).collect();
-    Ok((
-        mapped(recording, &rest)?,
-        Some(mapped(reference, &to_reference)?),
-    ))
-}
-
-/// CSV or Parquet.
-fn table(path: &Path) -> Result<Table, Failure> {
-    let mut start = Vec::new();
-    let reading = |error: std::io::Error| Error::reading(path, &error);
-    File::open(path)
-        .map_err(reading)?
-        .take(4)
-        .read_to_end(&mut start)
-        .map_err(reading)?;
-    Ok(match Format::of(path, &start) {
-        Format::Parquet => parquet::read(path)?.table,
-        _ => csv::read_table(path)?,
-    })
+    let (frame, other) = (mapped(recording, &rest)?, mapped(reference, &to_reference)?);
+    frame.refuse_left_out(model)?;
+    other.refuse_left_out(model)?;
+    Ok((frame, Some(other)))
 }
 
 fn mapped(table: Table, wanted: &[(String, String)]) -> Result<Frame, Failure> {

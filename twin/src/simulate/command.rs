@@ -3,14 +3,13 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use recording::{Table, convert};
+use recording::{Table, convert, output};
 
 use super::board::Board;
 use crate::{
     explain,
     failure::Failure,
     model::Model,
-    overwrite,
     prepare::{Inputs, Item, Prepared, Purpose, modelled_change, prepare},
     problem::{Base, Problem, View},
     progress::Progress,
@@ -56,9 +55,10 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
         ("--recording", arguments.recording.as_path()),
     ];
     let reference = reference.map(|path| ("--reference", path));
-    overwrite::refuse(&arguments.out, read.into_iter().chain(reference))?;
+    output::refuse_overwrite(&arguments.out, read.into_iter().chain(reference))?;
     let model = Model::read(&arguments.model)?;
-    overwrite::refuse(&arguments.out, model.ocv_file())?;
+    output::refuse_overwrite(&arguments.out, model.ocv_file())?;
+    output::check(&arguments.out)?;
     let inputs = Inputs {
         recording: arguments.recording.clone(),
         reference: arguments.reference.clone(),
