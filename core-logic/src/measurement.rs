@@ -23,10 +23,11 @@ use crate::converter::{
 use crate::design_parameters as design;
 use crate::diagnosis::{Changes, Code, CodeSet, Diagnosis, Effects};
 use crate::front_end::{Channel, FrontEnd, KeyFactors, PerRange, SupplyRelations};
+use crate::gap::{self, Gap, GapBridge};
 use crate::key_calibration::{
     KeyCalibration, KeyInputs, KeyOutputs, KeyPhase, KeyRefusal, KeySample, KeyState,
 };
-use crate::meter::{GapBridge, MeterCalibration, MeterConfig, MeterReport};
+use crate::meter::{MeterCalibration, MeterConfig, MeterReport};
 use crate::modbus::readings::CommandState;
 use crate::modbus::{Activity, Readings};
 use crate::open_sensor::{Finding, OpenSensor, OpenSensorThresholds};
@@ -257,6 +258,7 @@ pub struct Measurement {
     chatter: ChatterReport,
     compare: ChannelCompare,
     meter: MeterReport,
+    gap: Gap,
     meter_causes: Validity,
     /// [`Measurement::meter_config`] is another one since it was taken.
     meter_calibration_changed: bool,
@@ -457,6 +459,7 @@ impl Measurement {
             chatter: ChatterReport::default(),
             compare: ChannelCompare::new(),
             meter: MeterReport::default(),
+            gap: Gap::new(now),
             meter_causes: Validity::STALE,
             meter_calibration_changed: true,
             zero: ZeroCalibration::new(),
@@ -617,6 +620,7 @@ impl Measurement {
             report.charge_total = self.meter.charge_total;
         }
         self.meter = report;
+        self.gap.begin_at(report.at.unwrap_or(self.started));
         self.meter_causes = causes
             .and_if(report.at.is_none(), Validity::STALE)
             .and_if(report.lost, Validity::CHIP_FAULT);
@@ -899,6 +903,17 @@ impl Measurement {
             &reading,
         );
         self.average.push(&configuration.average, &reading);
+        self.gap.on_conversion(
+            &configuration.meter,
+            &gap::Conversion {
+                started,
+                finished: reading.at,
+                current: reading.current,
+                range: reading.range,
+                edges: history.edges,
+                is_valid: self.current_validity(reading.validity).is_valid(),
+            },
+        );
         self.compare.on_conversion(
             &configuration.compare,
             &Conversion {
@@ -1291,13 +1306,10 @@ impl Measurement {
         &self.diagnosis
     }
 
-    /// What bridges a gap of the meter: the averaged current while it is valid.
+    /// What bridges a gap of the meter.
     #[must_use]
-    pub fn bridge(&self, configuration: &Configuration) -> GapBridge {
-        match self.averaged(configuration) {
-            (current, validity, Some(_)) if validity.is_valid() => GapBridge::MeanCurrent(current),
-            _ => GapBridge::Unknown,
-        }
+    pub fn bridge(&self) -> GapBridge {
+        self.gap.bridge()
     }
 
     /// What must survive a reset.

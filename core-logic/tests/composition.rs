@@ -20,7 +20,7 @@ use core_logic::measurement::{
     ConverterFault, Environment, Found, Measurement, Order, Refusal, Tick, Vehicle,
     effective_meter_config,
 };
-use core_logic::meter::{GapBridge, MeterChannel, MeterReading, MeterReport};
+use core_logic::meter::{MeterChannel, MeterReading, MeterReport};
 use core_logic::modbus::readings::CommandState;
 use core_logic::modbus::{Activity, Readings};
 use core_logic::open_sensor::{network_output, network_output_open};
@@ -673,10 +673,13 @@ fn faults_of_the_converter_are_named_and_pass_with_the_next_sample() {
             .contains(Validity::STALE)
     );
     assert_eq!(bench.measurement.current().current, good.current);
+    // It is held for a conversion and two ticks: 200 ms are not covered.
+    let bridge = bench.measurement.bridge();
     assert_eq!(
-        bench.measurement.bridge(&bench.configuration),
-        GapBridge::Unknown
+        (bridge.current, bridge.until.as_ticks()),
+        (Some(good.current), 1_000_000)
     );
+    assert_eq!(bridge.holds.as_ticks(), PERIOD_US + 24_000);
     bench
         .measurement
         .on_converter_fault(ConverterFault::ConfigurationLost, now);
@@ -686,10 +689,7 @@ fn faults_of_the_converter_are_named_and_pass_with_the_next_sample() {
     bench.run_ms(2_000);
     assert!(!bench.has(Code::ConverterNoAnswer) && !bench.has(Code::ConverterConfigurationLost));
     assert!(bench.measurement.current().validity.is_valid());
-    assert_eq!(
-        bench.measurement.bridge(&bench.configuration),
-        GapBridge::MeanCurrent(good.current)
-    );
+    assert_eq!(bench.measurement.bridge().current, Some(good.current));
     // A sample with the power-up configuration byte.
     let invalid = bench.measurement.invalid_conversions();
     let sample = ConverterSample {
