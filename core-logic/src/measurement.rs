@@ -261,6 +261,8 @@ pub struct Measurement {
     gap: Gap,
     meter_causes: Validity,
     /// [`Measurement::meter_config`] is another one since it was taken.
+    /// As much of the meter's doubt as the state of charge has in its own.
+    doubted: Nanocoulombs,
     meter_calibration_changed: bool,
     zero: ZeroCalibration,
     zero_beyond_limit: bool,
@@ -463,6 +465,7 @@ impl Measurement {
             meter_causes: Validity::STALE,
             meter_calibration_changed: true,
             zero: ZeroCalibration::new(),
+            doubted: Nanocoulombs::ZERO,
             zero_beyond_limit: false,
             sweep: None,
             key: KeyCalibration::new(factors, now),
@@ -643,6 +646,11 @@ impl Measurement {
         self.soc_reading = self.soc.reading(&self.prepared.soc);
     }
 
+        let doubt = report.uncertainty.saturating_sub(self.doubted);
+        if doubt > Nanocoulombs::ZERO {
+            self.doubted = report.uncertainty;
+            self.soc.declare_loss(&self.prepared.soc, doubt);
+        }
     /// A battery voltage received over CAN.
     pub fn on_battery_voltage(&mut self, voltage: &can::BatteryVoltage, at: Instant) {
         self.cell_voltage = voltage.cell.map(|voltage| CellVoltage { voltage, at });

@@ -717,6 +717,34 @@ fn faults_of_the_converter_are_named_and_pass_with_the_next_sample() {
     );
 }
 
+/// What the meter may be wrong by, the state of charge may be wrong by as well: gaps, estimates and hand-overs while it runs.
+#[test]
+fn the_meters_doubts_are_the_state_of_charges_too() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(1_000);
+    bench
+        .measurement
+        .set_state_of_charge(Ppm(500_000), Ppm(10_000));
+    let doubt = |bench: &Bench| bench.measurement.retained(0).soc.uncertainty.get();
+    let before = doubt(&bench);
+    bench.report.uncertainty = Nanocoulombs::from_coulombs(300);
+    bench.run_ms(100);
+    let grown = doubt(&bench) - before;
+    // And what a tenth of a second costs anyway.
+    let (least, most) = (300_000_000_000, 301_000_000_000);
+    assert!((least..most).contains(&grown), "{grown} nC");
+    // Once, and only what is added; the share of the reading's hidden bits may go again.
+    bench.report.uncertainty = Nanocoulombs::from_coulombs(299);
+    bench.run_ms(100);
+    bench.report.uncertainty = Nanocoulombs::from_coulombs(310);
+    bench.run_ms(100);
+    let grown = doubt(&bench) - before;
+    assert!(
+        (least + 10_000_000_000..most + 10_000_000_000).contains(&grown),
+        "{grown} nC"
+    );
+}
+
 #[test]
 fn the_meters_state_is_the_charges_validity() {
     let mut bench = Bench::new(Configuration::default());
