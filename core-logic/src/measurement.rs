@@ -246,6 +246,8 @@ pub struct Measurement {
     prepared: Prepared,
     converter: Converter,
     converter_fault: Option<ConverterFault>,
+    /// The converter's configuration before the present one, of which a conversion may be under way.
+    retired: Option<u8>,
     conversions: u32,
     invalid_conversions: u32,
     refused_steps: u32,
@@ -259,10 +261,10 @@ pub struct Measurement {
     compare: ChannelCompare,
     meter: MeterReport,
     gap: Gap,
-    meter_causes: Validity,
-    /// [`Measurement::meter_config`] is another one since it was taken.
     /// As much of the meter's doubt as the state of charge has in its own.
     doubted: Nanocoulombs,
+    meter_causes: Validity,
+    /// [`Measurement::meter_config`] is another one since it was taken.
     meter_calibration_changed: bool,
     zero: ZeroCalibration,
     zero_beyond_limit: bool,
@@ -449,6 +451,7 @@ impl Measurement {
             prepared,
             converter: Converter::new(),
             converter_fault: None,
+            retired: None,
             conversions: 0,
             invalid_conversions: 0,
             refused_steps: 0,
@@ -462,10 +465,10 @@ impl Measurement {
             compare: ChannelCompare::new(),
             meter: MeterReport::default(),
             gap: Gap::new(now),
+            doubted: Nanocoulombs::ZERO,
             meter_causes: Validity::STALE,
             meter_calibration_changed: true,
             zero: ZeroCalibration::new(),
-            doubted: Nanocoulombs::ZERO,
             zero_beyond_limit: false,
             sweep: None,
             key: KeyCalibration::new(factors, now),
@@ -505,10 +508,20 @@ impl Measurement {
     /// The active configuration is another one: factors are worked out anew, nothing measured is lost. The meter's
     /// owner has to be handed [`Measurement::meter_config`] as well.
     pub fn configuration_changed(&mut self, configuration: &Configuration) {
-        let before = self.prepared.soc;
+        let Prepared {
+            converter,
+            soc: before,
+            ..
+        } = self.prepared;
         let (factors, supply) = (self.key.factors(), self.prepared.supply);
         self.prepare_again(configuration, factors, supply, self.now);
         self.compare.restart_at(meter_follows(self.now));
+        if converter.configuration() != self.prepared.converter.configuration() {
+            // Of two changes in a row: what is under way is of before the first.
+            self.retired = self.retired.or(Some(converter.configuration()));
+        }
+        self.converter
+            .reconfigured(&converter, &self.prepared.converter, self.now);
         if before.capacity() != self.prepared.soc.capacity() {
             self.soc.change_capacity(&before, &self.prepared.soc);
         }
@@ -549,6 +562,11 @@ impl Measurement {
         sample: &ConverterSample,
         history: &RangeHistory,
     ) {
+        let expected = configuration.converter.expected_configuration();
+        // Begun before the configuration changed: its scale is the old one, but nothing was lost.
+        if self.retired.take() == Some(sample.configuration) && sample.configuration != expected {
+            return;
+        }
         let context = self.context(configuration, history, sample.started);
         let reading = self.converter.on_sample(
             &configuration.converter,
@@ -556,7 +574,7 @@ impl Measurement {
             sample,
             &context,
         );
-        let lost = sample.configuration != configuration.converter.expected_configuration();
+        let lost = sample.configuration != expected;
         self.converter_fault = lost.then_some(ConverterFault::ConfigurationLost);
         if let Some(reading) = reading {
             self.on_reading(configuration, reading, sample.started, history);
@@ -628,6 +646,11 @@ impl Measurement {
             .and_if(report.at.is_none(), Validity::STALE)
             .and_if(report.lost, Validity::CHIP_FAULT);
         self.compare.on_meter(&configuration.compare, &report);
+        let doubt = report.uncertainty.saturating_sub(self.doubted);
+        if doubt > Nanocoulombs::ZERO {
+            self.doubted = report.uncertainty;
+            self.soc.declare_loss(&self.prepared.soc, doubt);
+        }
         let now = report.at.unwrap_or(self.now);
         self.soc.update(
             &self.prepared.soc,
@@ -646,11 +669,6 @@ impl Measurement {
         self.soc_reading = self.soc.reading(&self.prepared.soc);
     }
 
-        let doubt = report.uncertainty.saturating_sub(self.doubted);
-        if doubt > Nanocoulombs::ZERO {
-            self.doubted = report.uncertainty;
-            self.soc.declare_loss(&self.prepared.soc, doubt);
-        }
     /// A battery voltage received over CAN.
     pub fn on_battery_voltage(&mut self, voltage: &can::BatteryVoltage, at: Instant) {
         self.cell_voltage = voltage.cell.map(|voltage| CellVoltage { voltage, at });

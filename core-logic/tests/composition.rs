@@ -745,6 +745,74 @@ fn the_meters_doubts_are_the_state_of_charges_too() {
     );
 }
 
+/// Another data rate while a conversion of the old one is under way: nothing is lost, and nothing is late.
+#[test]
+fn another_data_rate_raises_no_diagnosis() {
+    use core_logic::converter::DataRate;
+    for (old, new) in [
+        (DataRate::Sps32, DataRate::Sps8),
+        (DataRate::Sps8, DataRate::Sps32),
+        (DataRate::Sps8, DataRate::Sps128),
+    ] {
+        let mut configuration = Configuration::default();
+        configuration.converter.data_rate = old;
+        let mut bench = Bench::new(configuration);
+        bench.next_conversion = u64::MAX;
+        let sample = |bench: &mut Bench, rate: DataRate, length: u64| {
+            let started = Instant::from_ticks(bench.now);
+            bench.run_ms(length / 1_000);
+            let mut of = bench.configuration.converter;
+            of.data_rate = rate;
+            let sample = ConverterSample {
+                started,
+                finished: Instant::from_ticks(bench.now),
+                configuration: of.expected_configuration(),
+                code: 1 << (rate.bits() - 2),
+            };
+            let history = bench.history();
+            bench
+                .measurement
+                .on_conversion(&bench.configuration, &sample, &history);
+        };
+        let nothing_raised = |bench: &Bench| {
+            let current = bench.measurement.current();
+            assert!(current.validity.is_valid(), "{old:?} {new:?}: {current:?}");
+            assert!(!bench.has(Code::ConverterConfigurationLost));
+            assert!(!bench.has(Code::ConverterStale));
+        };
+        let (slow, fast) = (old.period().as_ticks(), new.period().as_ticks());
+        for _ in 0..10 {
+            sample(&mut bench, old, slow);
+        }
+        nothing_raised(&bench);
+        // Half a conversion before the change, all of it after it.
+        bench.configuration.converter.data_rate = new;
+        bench
+            .measurement
+            .configuration_changed(&bench.configuration);
+        let current = bench.measurement.current().current;
+        sample(&mut bench, old, slow);
+        bench.run_ms(10);
+        nothing_raised(&bench);
+        assert_eq!(bench.measurement.current().current, current);
+        // The chip's first result of a new rate is discarded.
+        bench.run_ms(fast / 1_000);
+        nothing_raised(&bench);
+        for _ in 0..3 {
+            sample(&mut bench, new, fast);
+            bench.run_ms(10);
+            nothing_raised(&bench);
+        }
+        // A converter that is silent from the change on is found all the same.
+        bench.configuration.converter.data_rate = old;
+        bench
+            .measurement
+            .configuration_changed(&bench.configuration);
+        bench.run_ms((3 * slow + 3 * fast) / 1_000 + 20);
+        assert!(bench.has(Code::ConverterStale));
+    }
+}
+
 #[test]
 fn the_meters_state_is_the_charges_validity() {
     let mut bench = Bench::new(Configuration::default());
