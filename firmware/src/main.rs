@@ -959,7 +959,7 @@ mod app {
             (Ok((state, slots)), _) => {
                 start.state = Some(state);
                 start.slots = slots;
-                start.loss = identity::loss_over_reset(previous);
+                start.loss = identity::loss_over_reset(previous, policy);
             }
             (Err(_), Stored::Value(state) | Stored::Older(state)) => {
                 start.state = Some(*state);
