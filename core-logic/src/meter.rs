@@ -667,6 +667,8 @@ impl MeterChannel {
         };
         self.gaps = self.gaps.saturating_add(1);
         self.settle_pending(0);
+        // The current may have reversed in the gap.
+        self.booked.sign = 0;
         // A bridge that begins elsewhere is of before the newest reading became known, a tick ago: of it the current alone.
         let (charge, doubt, reached) = if bridge.since == begin {
             (bridge.charge, bridge.doubt, bridge.until.max(begin))
@@ -1903,6 +1905,29 @@ mod tests {
         let stale = bridge_of(Microamps::from_amps(20), 3_260_000, 3_290_000);
         let doubt = restart(&mut bench, 3_390_000, stale);
         near(doubt, 0.03 * 1.2 + 0.1 * (60.0 + 20.0), hidden_bits);
+    }
+
+    /// From 300 A before the gap to −53.3 A behind it: the hand-over at the edge is that of a charging current.
+    #[test]
+    fn a_sign_does_not_outlast_a_gap() {
+        let mut bench = Bench::new(MeterConfig::default(), Range::Large);
+        let _ = bench.read(20_000, 90);
+        bench.channel.on_meter_lost();
+        let history = bench.recorder.history(at(40_000));
+        let reading = MeterReading {
+            energy: bench.energy,
+            at: at(40_000),
+        };
+        let bridge = bridge_of(Microamps::from_amps(-53), 20_000, 40_000);
+        bench.channel.on_meter_restarted(reading, history, &bridge);
+        let before = bench.coulombs();
+        bench.edge(58_000, Range::Small);
+        let _ = bench.read(60_000, -30);
+        near(
+            bench.coulombs() - before,
+            -SWITCHING * 0.02,
+            per_count(Range::Large),
+        );
     }
 
     #[test]
