@@ -640,8 +640,9 @@ mod tests {
             for (row, element, at) in changes {
                 let field = &FIELDS[row.index(FIELDS.len())];
                 let element = usize::from(element) % usize::from(field.layout.count);
-                let span = (field.max - field.min) as u64;
-                let value = field.min.wrapping_add((at % (span + 1)) as i64);
+                let (min, max) = field.limits();
+                let span = (max - min) as u64;
+                let value = min.wrapping_add((at % (span + 1)) as i64);
                 let mut changed = configuration;
                 if field.put(&mut changed, element, value).is_ok() && changed.validate().is_ok() {
                     configuration = changed;
@@ -715,9 +716,10 @@ mod tests {
                 "{}",
                 text.name
             );
-            assert!(field.min < field.max, "{}", text.name);
+            let (min, max) = field.limits();
+            assert!(min < max, "{}", text.name);
             assert!(
-                field.min >= layout.kind.min() && field.max <= layout.kind.max(),
+                min >= layout.kind.min() && max <= layout.kind.max(),
                 "{}",
                 text.name
             );
@@ -737,6 +739,7 @@ mod tests {
             FIELDS[0].put(&mut base, 0, front_end).unwrap();
             let before = values(&base);
             for field in &FIELDS[1..] {
+                let (min, max) = field.limits();
                 for element in 0..usize::from(field.layout.count) {
                     let Some(old) = field.get(&base, element) else {
                         let id = FieldId {
@@ -744,12 +747,12 @@ mod tests {
                             element,
                         };
                         let mut changed = base;
-                        let refused = field.put(&mut changed, element, field.min);
+                        let refused = field.put(&mut changed, element, min);
                         assert_eq!(refused, Err(Violation::NotInUse(id)));
                         assert_eq!(changed, base);
                         continue;
                     };
-                    for new in [field.min, field.max] {
+                    for new in [min, max] {
                         let mut changed = base;
                         assert_eq!(field.put(&mut changed, element, new), Ok(()), "{field:?}");
                         for (was, is) in before.iter().zip(values(&changed)) {
@@ -767,7 +770,7 @@ mod tests {
                 let behind = usize::from(field.layout.count);
                 if behind > 1 {
                     assert_eq!(field.get(&base, behind), None);
-                    assert!(field.put(&mut base.clone(), behind, field.min).is_err());
+                    assert!(field.put(&mut base.clone(), behind, min).is_err());
                 }
             }
         }
@@ -776,7 +779,8 @@ mod tests {
     #[test]
     fn a_value_beyond_its_limits_is_named() {
         for field in FIELDS {
-            for value in [field.min - 1, field.max + 1] {
+            let (min, max) = field.limits();
+            for value in [min - 1, max + 1] {
                 let mut configuration = Configuration::default();
                 assert_eq!(
                     field.put(&mut configuration, 0, value),
@@ -786,8 +790,8 @@ mod tests {
                             element: 0
                         },
                         value,
-                        min: field.min,
-                        max: field.max,
+                        min,
+                        max,
                     })
                 );
                 assert_eq!(configuration, Configuration::default());
@@ -1074,11 +1078,12 @@ mod tests {
             let mut configuration = Configuration::default();
             FIELDS[0].put(&mut configuration, 0, front_end).unwrap();
             for field in &FIELDS[1..] {
+                let (min, max) = field.limits();
                 for element in 0..usize::from(field.layout.count) {
-                    let largest = if field.min.unsigned_abs() > field.max.unsigned_abs() {
-                        field.min
+                    let largest = if min.unsigned_abs() > max.unsigned_abs() {
+                        min
                     } else {
-                        field.max
+                        max
                     };
                     let _ = field.put(&mut configuration, element, largest);
                 }

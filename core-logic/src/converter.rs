@@ -380,6 +380,12 @@ impl ConverterCoefficients {
         self.channel
     }
 
+    /// The configuration byte that a sample has to come with.
+    #[must_use]
+    pub const fn configuration(&self) -> u8 {
+        self.configuration
+    }
+
     /// Whether the supply makes every reading invalid.
     #[must_use]
     pub const fn supply_fault(&self) -> bool {
@@ -660,6 +666,8 @@ pub struct Converter {
     accepted: Option<Level>,
     refused: Option<(Level, u8)>,
     run: Option<Run>,
+    /// After a change of the configuration: not stale before this.
+    stale_from: Option<Instant>,
     counters: ConverterCounters,
 }
 
@@ -686,6 +694,7 @@ impl Converter {
             accepted: None,
             refused: None,
             run: None,
+            stale_from: None,
             counters: ConverterCounters {
                 samples: 0,
                 duplicates: 0,
@@ -739,6 +748,20 @@ impl Converter {
         ))
     }
 
+    /// Another configuration of the chip from `at` on: a conversion that is under way is of the old one, and the first of
+    /// the new one has its own time before the current is stale.
+    pub fn reconfigured(
+        &mut self,
+        old: &ConverterCoefficients,
+        new: &ConverterCoefficients,
+        at: Instant,
+    ) {
+        if old.configuration != new.configuration {
+            self.stale_from =
+                at.checked_add_duration(old.stale_after.saturating_add(new.stale_after));
+        }
+    }
+
     /// Notes that the converter did not deliver (bus error, lost configuration): the last value stays, invalid, until
     /// the next good sample.
     pub fn on_fault(&mut self, at: Instant) -> CurrentReading {
@@ -755,7 +778,8 @@ impl Converter {
     pub fn reading(&self, coefficients: &ConverterCoefficients, now: Instant) -> CurrentReading {
         let is_stale = self
             .last_measured
-            .is_none_or(|at| elapsed(at, now) > coefficients.stale_after);
+            .is_none_or(|at| elapsed(at, now) > coefficients.stale_after)
+            && (self.last_measured.is_none() || self.stale_from.is_none_or(|from| now > from));
         let mut reading = self.reading;
         reading.validity = reading.validity.and_if(is_stale, Validity::STALE);
         reading

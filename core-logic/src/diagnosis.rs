@@ -6,7 +6,7 @@
 //! adds to current, charge and state of charge while it is active. A debounce of 0 means that the module which finds
 //! the condition debounces it itself. `docs/diagnosis.md` is this table.
 
-use crate::units::{Duration, Instant, elapsed};
+use crate::units::{Instant, elapsed, milliseconds};
 use crate::validity::Validity;
 
 /// How bad it is.
@@ -49,10 +49,10 @@ pub struct Effects {
 /// What the firmware needs of a row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Rule {
-    /// The condition must hold this long before the diagnosis is set.
-    pub set_after: Duration,
-    /// The condition must be gone this long before it is cleared.
-    pub clear_after: Duration,
+    /// The condition must hold this long before the diagnosis is set, in ms.
+    pub set_after_ms: u16,
+    /// The condition must be gone this long before it is cleared, in ms.
+    pub clear_after_ms: u16,
     /// Severity.
     pub severity: Severity,
     /// Latch.
@@ -94,8 +94,8 @@ macro_rules! diagnoses {
         /// The rules, by code.
         pub const RULES: [Rule; Code::COUNT] = [$(
             Rule {
-                set_after: Duration::from_ticks($set_ms * 1_000),
-                clear_after: Duration::from_ticks($clear_ms * 1_000),
+                set_after_ms: $set_ms,
+                clear_after_ms: $clear_ms,
                 severity: Severity::$severity,
                 latch: Latch::$latch,
                 effects: Effects {
@@ -445,11 +445,11 @@ impl Diagnosis {
             let rule = code.rule();
             let sets = conditions.contains(code);
             let debounce = if sets {
-                rule.set_after
+                rule.set_after_ms
             } else {
-                rule.clear_after
+                rule.clear_after_ms
             };
-            if elapsed(entry.differs_since, now) < debounce {
+            if elapsed(entry.differs_since, now) < milliseconds(u32::from(debounce)) {
                 continue;
             }
             self.active.set(code, sets);
@@ -584,10 +584,7 @@ mod tests {
     #[test]
     fn rows_that_are_fixed_elsewhere() {
         let rule = Code::ConverterNoAnswer.rule();
-        assert_eq!(
-            (rule.set_after.as_millis(), rule.clear_after.as_millis()),
-            (100, 500)
-        );
+        assert_eq!((rule.set_after_ms, rule.clear_after_ms), (100, 500));
         assert_eq!(rule.effects.current, Validity::CHIP_FAULT);
         assert_eq!(rule.effects.charge, Validity::VALID);
         let open = Code::OpenSensor.rule();
@@ -602,8 +599,8 @@ mod tests {
         assert_eq!(Code::HvWithoutPermit.rule().severity, Severity::Critical);
         assert_eq!(Code::HvWithoutPermit.rule().latch, Latch::UntilCleared);
         // F3 and F10: validity drops within 100 ms and 200 ms.
-        assert!(Code::MeterDeadBus.rule().set_after.as_millis() + 2 * 20 <= 100);
-        assert_eq!(Code::FlagImplausible.rule().set_after.as_millis(), 0);
+        assert!(Code::MeterDeadBus.rule().set_after_ms + 2 * 20 <= 100);
+        assert_eq!(Code::FlagImplausible.rule().set_after_ms, 0);
         assert!(Severity::Critical > Severity::Error && Severity::Warning > Severity::Info);
     }
 
@@ -797,8 +794,8 @@ mod tests {
                         reference.history = None;
                     } else {
                         let (_, since) = *reference.history.get_or_insert((condition, now));
-                        let debounce = if condition { rule.set_after } else { rule.clear_after };
-                        if now - since >= debounce.as_millis() {
+                        let debounce = if condition { rule.set_after_ms } else { rule.clear_after_ms };
+                        if now - since >= u64::from(debounce) {
                             reference.active = condition;
                             reference.history = None;
                             reference.occurrences += u16::from(condition);

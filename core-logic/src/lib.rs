@@ -20,6 +20,7 @@ pub mod diagnosis;
 pub mod e2e;
 pub mod error_budget;
 pub mod front_end;
+pub mod gap;
 pub mod key_calibration;
 pub mod measurement;
 pub mod meter;

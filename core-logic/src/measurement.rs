@@ -23,10 +23,11 @@ use crate::converter::{
 use crate::design_parameters as design;
 use crate::diagnosis::{Changes, Code, CodeSet, Diagnosis, Effects};
 use crate::front_end::{Channel, FrontEnd, KeyFactors, PerRange, SupplyRelations};
+use crate::gap::{self, Gap, GapBridge};
 use crate::key_calibration::{
     KeyCalibration, KeyInputs, KeyOutputs, KeyPhase, KeyRefusal, KeySample, KeyState,
 };
-use crate::meter::{GapBridge, MeterCalibration, MeterConfig, MeterReport};
+use crate::meter::{MeterCalibration, MeterConfig, MeterReport};
 use crate::modbus::readings::CommandState;
 use crate::modbus::{Activity, Readings};
 use crate::open_sensor::{Finding, OpenSensor, OpenSensorThresholds};
@@ -245,6 +246,8 @@ pub struct Measurement {
     prepared: Prepared,
     converter: Converter,
     converter_fault: Option<ConverterFault>,
+    /// The converter's configuration before the present one, of which a conversion may be under way.
+    retired: Option<u8>,
     conversions: u32,
     invalid_conversions: u32,
     refused_steps: u32,
@@ -257,6 +260,9 @@ pub struct Measurement {
     chatter: ChatterReport,
     compare: ChannelCompare,
     meter: MeterReport,
+    gap: Gap,
+    /// As much of the meter's doubt as the state of charge has in its own.
+    doubted: Nanocoulombs,
     meter_causes: Validity,
     /// [`Measurement::meter_config`] is another one since it was taken.
     meter_calibration_changed: bool,
@@ -447,6 +453,7 @@ impl Measurement {
             prepared,
             converter: Converter::new(),
             converter_fault: None,
+            retired: None,
             conversions: 0,
             invalid_conversions: 0,
             refused_steps: 0,
@@ -459,6 +466,8 @@ impl Measurement {
             chatter: ChatterReport::default(),
             compare: ChannelCompare::new(),
             meter: MeterReport::default(),
+            gap: Gap::new(now),
+            doubted: Nanocoulombs::ZERO,
             meter_causes: Validity::STALE,
             meter_calibration_changed: true,
             zero: ZeroCalibration::new(),
@@ -502,7 +511,11 @@ impl Measurement {
     /// The active configuration is another one: factors are worked out anew, nothing measured is lost. The meter's
     /// owner has to be handed [`Measurement::meter_config`] as well.
     pub fn configuration_changed(&mut self, configuration: &Configuration) {
-        let before = self.prepared.soc;
+        let Prepared {
+            converter,
+            soc: before,
+            ..
+        } = self.prepared;
         if self.key_factors_set != configuration.key_factors {
             self.key_factors_set = configuration.key_factors;
             self.key.set_factors(configuration.key_factors);
@@ -510,6 +523,12 @@ impl Measurement {
         let (factors, supply) = (self.key.factors(), self.prepared.supply);
         self.prepare_again(configuration, factors, supply, self.now);
         self.compare.restart_at(meter_follows(self.now));
+        if converter.configuration() != self.prepared.converter.configuration() {
+            // Of two changes in a row: what is under way is of before the first.
+            self.retired = self.retired.or(Some(converter.configuration()));
+        }
+        self.converter
+            .reconfigured(&converter, &self.prepared.converter, self.now);
         if before.capacity() != self.prepared.soc.capacity() {
             self.soc.change_capacity(&before, &self.prepared.soc);
         }
@@ -550,6 +569,11 @@ impl Measurement {
         sample: &ConverterSample,
         history: &RangeHistory,
     ) {
+        let expected = configuration.converter.expected_configuration();
+        // Begun before the configuration changed: its scale is the old one, but nothing was lost.
+        if self.retired.take() == Some(sample.configuration) && sample.configuration != expected {
+            return;
+        }
         let context = self.context(configuration, history, sample.started);
         let reading = self.converter.on_sample(
             &configuration.converter,
@@ -557,7 +581,7 @@ impl Measurement {
             sample,
             &context,
         );
-        let lost = sample.configuration != configuration.converter.expected_configuration();
+        let lost = sample.configuration != expected;
         self.converter_fault = lost.then_some(ConverterFault::ConfigurationLost);
         if let Some(reading) = reading {
             self.on_reading(configuration, reading, sample.started, history);
@@ -624,10 +648,16 @@ impl Measurement {
             report.charge_total = self.meter.charge_total;
         }
         self.meter = report;
+        self.gap.begin_at(report.at.unwrap_or(self.started));
         self.meter_causes = causes
             .and_if(report.at.is_none(), Validity::STALE)
             .and_if(report.lost, Validity::CHIP_FAULT);
         self.compare.on_meter(&configuration.compare, &report);
+        let doubt = report.uncertainty.saturating_sub(self.doubted);
+        if doubt > Nanocoulombs::ZERO {
+            self.doubted = report.uncertainty;
+            self.soc.declare_loss(&self.prepared.soc, doubt);
+        }
         let now = report.at.unwrap_or(self.now);
         self.soc.update(
             &self.prepared.soc,
@@ -913,6 +943,17 @@ impl Measurement {
             &reading,
         );
         self.average.push(&configuration.average, &reading);
+        self.gap.on_conversion(
+            &configuration.meter,
+            &gap::Conversion {
+                started,
+                finished: reading.at,
+                current: reading.current,
+                range: reading.range,
+                edges: history.edges,
+                is_valid: self.current_validity(reading.validity).is_valid(),
+            },
+        );
         self.compare.on_conversion(
             &configuration.compare,
             &Conversion {
@@ -1304,13 +1345,10 @@ impl Measurement {
         &self.diagnosis
     }
 
-    /// What bridges a gap of the meter: the averaged current while it is valid.
+    /// What bridges a gap of the meter.
     #[must_use]
-    pub fn bridge(&self, configuration: &Configuration) -> GapBridge {
-        match self.averaged(configuration) {
-            (current, validity, Some(_)) if validity.is_valid() => GapBridge::MeanCurrent(current),
-            _ => GapBridge::Unknown,
-        }
+    pub fn bridge(&self) -> GapBridge {
+        self.gap.bridge()
     }
 
     /// What must survive a reset.

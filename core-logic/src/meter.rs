@@ -63,6 +63,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::design_parameters as design;
 use crate::front_end::PerRange;
+use crate::gap::{GapBridge, converter_error};
 use crate::range::{Range, RangeHistory, RangeInterval};
 use crate::units::{
     Duration, Instant, Microamps, Nanocoulombs, Ppm, add_i128, clamp_i32, clamp_i64, div_round,
@@ -80,6 +81,8 @@ pub const REJECTIONS_UNTIL_LOST: u8 = 3;
 /// Shortest interval whose mean current is compared with the one that bridged a gap: half a poll, in which a count is
 /// 0.7 A in the small range.
 const SHORTEST_MEAN: Duration = Duration::from_ticks(10_000);
+/// From the board's start to the meter's first reading when nothing is amiss: the self-test of 100 ms and two polls.
+const FIRST_READING: Duration = Duration::from_ticks(200_000);
 /// 1.2 times the counts per µs at full scale, with 32 binary digits: the fastest that the meter may appear to count.
 /// 1.2 covers the tolerances of gain, reference and divider and an input that clips beyond its full scale.
 const FASTEST_COUNTS_PER_US_Q32: u64 = design::METER_COUNTS_PER_SECOND_Q32 * 6 / 5 / 1_000_000;
@@ -248,16 +251,6 @@ pub enum ReadingOutcome {
     Estimated,
     /// Not used.
     Rejected(Rejection),
-}
-
-/// What is known about the current during a gap.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[cfg_attr(feature = "defmt", derive(defmt::Format))]
-pub enum GapBridge {
-    /// Its mean, from the converter.
-    MeanCurrent(Microamps),
-    /// Nothing: the gap's charge is missing, and the uncertainty grows by full scale.
-    Unknown,
 }
 
 /// What the meter has counted.
@@ -481,8 +474,11 @@ pub struct MeterChannel {
     /// As it was before the newest reading, should that one turn out to be wrong.
     before: Option<Booked>,
     uncertainty: Accumulator,
-    /// The last gap's length and the current that bridged it, until a reading behind it shows what flowed there.
+    /// The time at the last gap's end which no conversion covered, and the current that bridged it, until a reading
+    /// behind it shows what flowed there.
     bridged: Option<(Duration, Microamps)>,
+    /// When the board has started, if it has said so.
+    started: Option<Instant>,
     window: Option<(Instant, Accumulator)>,
     mean_current: Microamps,
     mean_over: Duration,
@@ -515,6 +511,7 @@ impl MeterChannel {
             before: None,
             uncertainty: Accumulator::default(),
             bridged: None,
+            started: None,
             window: None,
             mean_current: Microamps::ZERO,
             mean_over: Duration::from_ticks(0),
@@ -563,12 +560,20 @@ impl MeterChannel {
         self.window = None;
     }
 
+    /// The board has started at `at`: what flows before the first reading is a gap if that comes late.
+    pub const fn start(&mut self, at: Instant) {
+        self.started = Some(at);
+    }
+
     /// A reading, with the range history of the same instant.
     pub fn on_reading(&mut self, reading: MeterReading, history: RangeHistory) -> ReadingOutcome {
         if self.lost {
             return self.reject(Rejection::Lost);
         }
         let Some((last, earlier)) = self.booked.last else {
+            if self.gap_before_first(reading.at).is_some() {
+                return ReadingOutcome::Rejected(Rejection::TooLate);
+            }
             self.begin(reading, history);
             return ReadingOutcome::First;
         };
@@ -648,41 +653,57 @@ impl MeterChannel {
         &mut self,
         reading: MeterReading,
         history: RangeHistory,
-        bridge: GapBridge,
+        bridge: &GapBridge,
     ) {
         self.lost = false;
         self.consecutive_rejections = 0;
-        let Some((last, _)) = self.booked.last else {
+        let begin = match self.booked.last {
+            Some((last, _)) => Some(last.at),
+            None => self.gap_before_first(reading.at),
+        };
+        let Some(begin) = begin else {
             self.begin(reading, history);
             return;
         };
         self.gaps = self.gaps.saturating_add(1);
         self.settle_pending(0);
-        let length = elapsed(last.at, reading.at);
-        let charge = match bridge {
-            GapBridge::MeanCurrent(current) => charge_of(current, length),
-            GapBridge::Unknown => 0,
+        // The current may have reversed in the gap.
+        self.booked.sign = 0;
+        // A bridge that begins elsewhere is of before the newest reading became known, a tick ago: of it the current alone.
+        let (charge, doubt, reached) = if bridge.since == begin {
+            (bridge.charge, bridge.doubt, bridge.until.max(begin))
+        } else {
+            (Nanocoulombs::ZERO, Nanocoulombs::ZERO, begin)
         };
-        self.book(charge);
+        let current = bridge.current.unwrap_or_default();
+        let tail = elapsed(reached, reading.at);
+        let holds = elapsed(bridge.until, reading.at) <= bridge.holds;
+        let error = if holds {
+            self.bridged = Some((tail, current));
+            converter_error(&self.config, current)
+        } else {
+            self.bridged = None;
+            let stays_small = self.booked.last.is_some_and(|(_, earlier)| {
+                earlier.edges == history.edges && history.range == Range::Small
+            });
+            let full_scale = if stays_small {
+                self.config.full_scale.small
+            } else {
+                self.config.full_scale.large
+            };
+            full_scale
+                .saturating_abs()
+                .saturating_add(current.saturating_abs())
+        };
+        self.book(add_i128(
+            mul_wide(charge.get(), NANOCOULOMB),
+            charge_of(current, tail),
+        ));
         self.change_scale(0);
-        let doubt = match bridge {
-            GapBridge::Unknown => charge_of(self.config.full_scale.large.saturating_abs(), length),
-            _ => {
-                let gain = i128::from(self.config.bridge_gain.get()).abs();
-                add_i128(
-                    mul_i128(
-                        div_round_i128(charge.abs(), i128::from(Ppm::ONE.get())),
-                        gain,
-                    ),
-                    charge_of(self.config.bridge_offset.saturating_abs(), length),
-                )
-            }
-        };
-        self.uncertainty.add(doubt);
-        self.bridged = match bridge {
-            GapBridge::MeanCurrent(current) => Some((length, current)),
-            GapBridge::Unknown => None,
-        };
+        self.uncertainty.add(add_i128(
+            mul_wide(doubt.get(), NANOCOULOMB),
+            charge_of(error, tail),
+        ));
         self.before = None;
         self.booked.last = Some((reading, history));
         self.update_mean(reading.at);
@@ -721,6 +742,12 @@ impl MeterChannel {
             // Rounded up, with the rounding of the total itself.
             uncertainty: Nanocoulombs(uncertainty.whole.saturating_add(2)),
         }
+    }
+
+    /// When the gap has begun that ends with a first reading at `now`, if there is one.
+    fn gap_before_first(&self, now: Instant) -> Option<Instant> {
+        self.started
+            .filter(|&start| elapsed(start, now) > FIRST_READING)
     }
 
     fn begin(&mut self, reading: MeterReading, history: RangeHistory) {
@@ -1114,6 +1141,22 @@ mod tests {
 
         fn doubt(&self) -> f64 {
             self.channel.report().uncertainty.get() as f64 * 1e-9
+        }
+    }
+
+    /// What the converter says of the time up to `until`: this mean current.
+    fn bridge_of(current: Microamps, since: u64, until: u64) -> GapBridge {
+        let length = Duration::from_ticks(until - since);
+        let charge_of = |current: Microamps| {
+            Nanocoulombs(i64::from(current.get()) * length.as_ticks() as i64 / 1_000)
+        };
+        GapBridge {
+            since: at(since),
+            until: at(until),
+            charge: charge_of(current),
+            doubt: charge_of(converter_error(&MeterConfig::default(), current)),
+            current: Some(current),
+            holds: Duration::from_ticks(55_000),
         }
     }
 
@@ -1737,7 +1780,7 @@ mod tests {
         bench.channel.on_meter_restarted(
             reading,
             history,
-            GapBridge::MeanCurrent(Microamps::from_amps(0)),
+            &bridge_of(Microamps::from_amps(0), 960_000, 991_000),
         );
         near(bench.doubt() - doubt, 0.04, 3e-9);
         // Too short an interval to tell a current.
@@ -1811,7 +1854,7 @@ mod tests {
             };
             let doubt = bench.doubt();
             let history = bench.recorder.history(at(us));
-            bench.channel.on_meter_restarted(reading, history, bridge);
+            bench.channel.on_meter_restarted(reading, history, &bridge);
             assert!(!bench.channel.report().lost);
             bench.doubt() - doubt
         };
@@ -1819,7 +1862,7 @@ mod tests {
         let doubt = restart(
             &mut bench,
             1_050_000,
-            GapBridge::MeanCurrent(Microamps::from_amps(20)),
+            bridge_of(Microamps::from_amps(20), 1_000_000, 1_030_000),
         );
         near(bench.coulombs() - before, 1.0, 1e-9);
         near(doubt, 0.01 + 0.05, 3e-9);
@@ -1831,13 +1874,14 @@ mod tests {
             1e-8,
         );
         let _ = bench.read(1_180_000, 0);
-        let doubt = restart(&mut bench, 2_180_000, GapBridge::Unknown);
+        // Nothing is known of the current: anything that the sensor in use can show …
+        let doubt = restart(&mut bench, 2_180_000, GapBridge::UNKNOWN);
         near(
             bench.coulombs() - before,
             1.0 + 50.0 * per_count(Range::Small),
             1e-8,
         );
-        near(doubt, 600.0, 3e-9);
+        near(doubt, 60.0, 3e-9);
         assert_eq!(bench.channel.report().gaps, 2);
         assert_eq!(bench.channel.report().at, Some(at(2_180_000)));
         // Nothing bridged that gap, so there is nothing to compare.
@@ -1845,6 +1889,72 @@ mod tests {
         let doubt = bench.doubt();
         let _ = bench.read(2_200_000, 100);
         near(bench.doubt(), doubt, hidden_bits);
+        // … or the large one, where the flag has changed.
+        bench.edge(2_300_000, Range::Large);
+        bench.edge(2_400_000, Range::Small);
+        let doubt = restart(&mut bench, 3_200_000, GapBridge::UNKNOWN);
+        near(doubt, 600.0, hidden_bits);
+        // What the converter saw of another time counts no further than to its end: 20 A for the 40 ms of the gap.
+        let _ = bench.read(3_220_000, 100);
+        let before = bench.coulombs();
+        let other = bridge_of(Microamps::from_amps(20), 3_200_000, 3_240_000);
+        let doubt = restart(&mut bench, 3_260_000, other);
+        near(bench.coulombs() - before, 0.8, 1e-9);
+        near(doubt, 0.04 * 1.2, hidden_bits);
+        // No conversion for too long: the last one is held, and what it may hide doubted.
+        let stale = bridge_of(Microamps::from_amps(20), 3_260_000, 3_290_000);
+        let doubt = restart(&mut bench, 3_390_000, stale);
+        near(doubt, 0.03 * 1.2 + 0.1 * (60.0 + 20.0), hidden_bits);
+    }
+
+    /// From 300 A before the gap to −53.3 A behind it: the hand-over at the edge is that of a charging current.
+    #[test]
+    fn a_sign_does_not_outlast_a_gap() {
+        let mut bench = Bench::new(MeterConfig::default(), Range::Large);
+        let _ = bench.read(20_000, 90);
+        bench.channel.on_meter_lost();
+        let history = bench.recorder.history(at(40_000));
+        let reading = MeterReading {
+            energy: bench.energy,
+            at: at(40_000),
+        };
+        let bridge = bridge_of(Microamps::from_amps(-53), 20_000, 40_000);
+        bench.channel.on_meter_restarted(reading, history, &bridge);
+        let before = bench.coulombs();
+        bench.edge(58_000, Range::Small);
+        let _ = bench.read(60_000, -30);
+        near(
+            bench.coulombs() - before,
+            -SWITCHING * 0.02,
+            per_count(Range::Large),
+        );
+    }
+
+    #[test]
+    fn a_first_reading_that_comes_late_ends_a_gap() {
+        for (late, gaps) in [(false, 0), (true, 1)] {
+            let mut channel = MeterChannel::new(MeterConfig::default());
+            channel.start(at(5_000));
+            let now = at(5_000 + FIRST_READING.as_ticks() + u64::from(late));
+            let reading = MeterReading {
+                energy: 77,
+                at: now,
+            };
+            let history = RangeHistory::steady(now, Range::Large);
+            let bridge = bridge_of(Microamps::from_amps(300), 5_000, now.as_ticks() - 1);
+            match channel.on_reading(reading, history) {
+                ReadingOutcome::First => assert!(!late),
+                outcome => {
+                    assert_eq!(outcome, ReadingOutcome::Rejected(Rejection::TooLate));
+                    channel.on_meter_restarted(reading, history, &bridge);
+                }
+            }
+            let report = channel.report();
+            let charge = report.charge_total.get() as f64 * 1e-9;
+            near(charge, if late { 60.0 } else { 0.0 }, 1e-3);
+            assert_eq!((report.gaps, report.at), (gaps, Some(now)));
+            assert_eq!(report.rejected, 0);
+        }
     }
 
     #[test]
@@ -1868,7 +1978,7 @@ mod tests {
             channel.on_reading(reading, history),
             ReadingOutcome::Rejected(Rejection::Lost)
         );
-        channel.on_meter_restarted(reading, history, GapBridge::Unknown);
+        channel.on_meter_restarted(reading, history, &GapBridge::UNKNOWN);
         assert_eq!(channel.report().gaps, 0);
         assert_eq!(channel.report().charge_total, Nanocoulombs(0));
         assert!(!channel.report().lost);
@@ -1889,7 +1999,7 @@ mod tests {
         let history = bench.recorder.history(at(2_000));
         bench
             .channel
-            .on_meter_restarted(reading, history, GapBridge::Unknown);
+            .on_meter_restarted(reading, history, &GapBridge::UNKNOWN);
         let _ = bench.read(3_000, 9_999);
         assert!(!bench.channel.report().lost);
     }
@@ -2053,12 +2163,15 @@ mod tests {
                 let reading = MeterReading { energy, at: at(now) };
                 let outcome = channel.on_reading(reading, history);
                 if matches!(outcome, ReadingOutcome::Rejected(_)) && flags[2] {
-                    let bridge = if edges[1] % 3 == 0 {
-                        GapBridge::Unknown
-                    } else {
-                        GapBridge::MeanCurrent(Microamps(currents[7]))
+                    let bridge = GapBridge {
+                        since: at(times[0]),
+                        until: at(times[1]),
+                        charge: Nanocoulombs(i64::from(currents[6]) << (edges[1] % 33)),
+                        doubt: Nanocoulombs(i64::from(currents[5]) << (edges[1] % 33)),
+                        current: (edges[1] % 3 != 0).then_some(Microamps(currents[7])),
+                        holds: Duration::from_ticks(times[2]),
                     };
-                    channel.on_meter_restarted(reading, history, bridge);
+                    channel.on_meter_restarted(reading, history, &bridge);
                 }
                 let _ = channel.report();
             }

@@ -33,8 +33,9 @@ use crate::design_parameters::{
 };
 use crate::ocv::OcvTable;
 use crate::units::{
-    Duration, Instant, Microamps, Microvolts, Nanocoulombs, Ppm, clamp_i32, clamp_i32_inline,
-    clamp_i64, div_i128, div_round, elapsed, milliseconds, mul_div, mul_wide,
+    Duration, Instant, Microamps, Microvolts, Nanocoulombs, Ppm, add_i64, clamp_i32,
+    clamp_i32_inline, clamp_i64, div_i128, div_round, elapsed, isqrt, milliseconds, mul_div,
+    mul_wide, sub_i64,
 };
 
 /// Charging excursions up to this bear no efficiency loss: 150 counts of the small range, 15 of the large one, and a
@@ -496,10 +497,10 @@ impl Soc {
     fn integrate(&mut self, coefficients: &SocCoefficients, delta: i64) {
         let mut remaining = self.kept.remaining.get() - delta;
         if delta >= 0 {
-            self.kept.discharged.0 = self.kept.discharged.get().saturating_add(delta);
+            self.kept.discharged.0 = add_i64(self.kept.discharged.get(), delta);
             self.slack = (self.slack + delta).min(EFFICIENCY_BAND.get());
         } else {
-            self.kept.charged.0 = self.kept.charged.get().saturating_sub(delta);
+            self.kept.charged.0 = sub_i64(self.kept.charged.get(), delta);
             self.slack += delta;
             if self.slack < 0 {
                 remaining -= self.loss(coefficients, self.slack.unsigned_abs());
@@ -508,7 +509,7 @@ impl Soc {
         }
         let limited = remaining.clamp(0, coefficients.capacity);
         if limited != remaining {
-            self.clipped = self.clipped.saturating_add((remaining - limited).abs());
+            self.clipped = add_i64(self.clipped, (remaining - limited).abs());
         }
         self.kept.remaining.0 = limited;
     }
@@ -534,9 +535,9 @@ impl Soc {
         let time_us = i64::try_from(time.as_ticks()).unwrap_or(i64::MAX);
         let step = coefficients.slew_per_us.saturating_mul(time_us) >> SLEW_PLACES;
         self.kept.presented_offset.0 = if offset > 0 {
-            offset.saturating_sub(step).max(0)
+            sub_i64(offset, step).max(0)
         } else {
-            offset.saturating_add(step).min(0)
+            add_i64(offset, step).min(0)
         };
         self.keep_presented_inside(coefficients);
     }
@@ -561,10 +562,7 @@ impl Soc {
         self.aged_throughput = throughput;
         self.pending_us = 0;
         self.pending_idle_us = 0;
-        self.grow_uncertainty(
-            coefficients,
-            gain.saturating_add(offset).saturating_add(no_load),
-        );
+        self.grow_uncertainty(coefficients, add_i64(add_i64(gain, offset), no_load));
     }
 
     fn look_at_rest(
@@ -632,10 +630,10 @@ impl Soc {
                     .unsigned_abs(),
             );
             let blend = Blend::of(prior, table_width);
-            let step = mul_div(target.saturating_sub(before), blend.weight_ppm, 1_000_000);
-            self.kept.remaining.0 = before.saturating_add(step).clamp(0, coefficients.capacity);
+            let step = mul_div(sub_i64(target, before), blend.weight_ppm, 1_000_000);
+            self.kept.remaining.0 = add_i64(before, step).clamp(0, coefficients.capacity);
             self.kept.uncertainty.0 = coefficients.charge_of(Ppm(clamp_i32(blend.width)));
-            self.kept.presented_offset.0 = self.kept.presented_offset.get().saturating_sub(step);
+            self.kept.presented_offset.0 = sub_i64(self.kept.presented_offset.get(), step);
             self.keep_presented_inside(coefficients);
         } else {
             self.kept.remaining.0 = target;
@@ -668,7 +666,7 @@ impl Blend {
         let (prior2, table2) = (prior * prior, table * table);
         let sum = prior2 + table2;
         let weight = (prior2 * 1_000_000 + sum / 2) / sum;
-        let width = prior * table / sum.isqrt().max(1);
+        let width = prior * table / isqrt(sum).max(1);
         // The table's error is common to every reading of it: below 1/√2 of it nothing is gained by repetition.
         let floor = prior.min(table * 707_107 / 1_000_000);
         Self {

@@ -18,8 +18,8 @@ use crate::design_parameters::{
 };
 use crate::front_end::{SupplyRelations, TURNS_LIMITS};
 use crate::units::{
-    Microamps, Microvolts, clamp_i32, clamp_i64, div_i128, div_round_i128, mul_i64, mul_i128,
-    mul_wide, sub_i128,
+    Microamps, Microvolts, clamp_i32, clamp_i64, div_i128, div_round_i128, isqrt, mul_i64,
+    mul_i128, mul_wide, sub_i128,
 };
 
 /// Points that one run takes.
@@ -369,7 +369,9 @@ impl Sums {
         // At most the square of the largest output, 2.5·10¹³ µV².
         let variance = clamp_i64(div_i128(squares, mul_i128(i128::from(n * (n - 2)), spread)));
         let limit = i64::from(config.max_residual.saturating_abs().get());
-        let residual = Microvolts(clamp_i32(variance.max(0).isqrt()));
+        let residual = Microvolts(clamp_i32(
+            isqrt(variance.max(0).cast_unsigned()).cast_signed(),
+        ));
         if variance > limit * limit {
             return Err(SupplyRefusal::Unstable(run, residual));
         }

@@ -491,8 +491,8 @@ fn the_document_of_the_diagnoses_is_up_to_date() {
             words.name,
             words.condition,
             words.threshold,
-            rule.set_after.as_millis(),
-            rule.clear_after.as_millis(),
+            rule.set_after_ms,
+            rule.clear_after_ms,
             format!("{:?}", rule.severity).to_lowercase(),
             if rule.latch == Latch::UntilCleared {
                 "yes"

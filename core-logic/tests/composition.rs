@@ -20,7 +20,7 @@ use core_logic::measurement::{
     ConverterFault, Environment, Found, Measurement, Order, Refusal, Tick, Vehicle,
     effective_meter_config,
 };
-use core_logic::meter::{GapBridge, MeterChannel, MeterReading, MeterReport};
+use core_logic::meter::{MeterChannel, MeterReading, MeterReport};
 use core_logic::modbus::readings::CommandState;
 use core_logic::modbus::{Activity, Readings};
 use core_logic::open_sensor::{network_output, network_output_open};
@@ -690,10 +690,13 @@ fn faults_of_the_converter_are_named_and_pass_with_the_next_sample() {
             .contains(Validity::STALE)
     );
     assert_eq!(bench.measurement.current().current, good.current);
+    // It is held for a conversion and two ticks: 200 ms are not covered.
+    let bridge = bench.measurement.bridge();
     assert_eq!(
-        bench.measurement.bridge(&bench.configuration),
-        GapBridge::Unknown
+        (bridge.current, bridge.until.as_ticks()),
+        (Some(good.current), 1_000_000)
     );
+    assert_eq!(bridge.holds.as_ticks(), PERIOD_US + 24_000);
     bench
         .measurement
         .on_converter_fault(ConverterFault::ConfigurationLost, now);
@@ -703,10 +706,7 @@ fn faults_of_the_converter_are_named_and_pass_with_the_next_sample() {
     bench.run_ms(2_000);
     assert!(!bench.has(Code::ConverterNoAnswer) && !bench.has(Code::ConverterConfigurationLost));
     assert!(bench.measurement.current().validity.is_valid());
-    assert_eq!(
-        bench.measurement.bridge(&bench.configuration),
-        GapBridge::MeanCurrent(good.current)
-    );
+    assert_eq!(bench.measurement.bridge().current, Some(good.current));
     // A sample with the power-up configuration byte.
     let invalid = bench.measurement.invalid_conversions();
     let sample = ConverterSample {
@@ -732,6 +732,102 @@ fn faults_of_the_converter_are_named_and_pass_with_the_next_sample() {
         good.current,
         "never 0 A, never −60 A"
     );
+}
+
+/// What the meter may be wrong by, the state of charge may be wrong by as well: gaps, estimates and hand-overs while it runs.
+#[test]
+fn the_meters_doubts_are_the_state_of_charges_too() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(1_000);
+    bench
+        .measurement
+        .set_state_of_charge(Ppm(500_000), Ppm(10_000));
+    let doubt = |bench: &Bench| bench.measurement.retained(0).soc.uncertainty.get();
+    let before = doubt(&bench);
+    bench.report.uncertainty = Nanocoulombs::from_coulombs(300);
+    bench.run_ms(100);
+    let grown = doubt(&bench) - before;
+    // And what a tenth of a second costs anyway.
+    let (least, most) = (300_000_000_000, 301_000_000_000);
+    assert!((least..most).contains(&grown), "{grown} nC");
+    // Once, and only what is added; the share of the reading's hidden bits may go again.
+    bench.report.uncertainty = Nanocoulombs::from_coulombs(299);
+    bench.run_ms(100);
+    bench.report.uncertainty = Nanocoulombs::from_coulombs(310);
+    bench.run_ms(100);
+    let grown = doubt(&bench) - before;
+    assert!(
+        (least + 10_000_000_000..most + 10_000_000_000).contains(&grown),
+        "{grown} nC"
+    );
+}
+
+/// Another data rate while a conversion of the old one is under way: nothing is lost, and nothing is late.
+#[test]
+fn another_data_rate_raises_no_diagnosis() {
+    use core_logic::converter::DataRate;
+    for (old, new) in [
+        (DataRate::Sps32, DataRate::Sps8),
+        (DataRate::Sps8, DataRate::Sps32),
+        (DataRate::Sps8, DataRate::Sps128),
+    ] {
+        let mut configuration = Configuration::default();
+        configuration.converter.data_rate = old;
+        let mut bench = Bench::new(configuration);
+        bench.next_conversion = u64::MAX;
+        let sample = |bench: &mut Bench, rate: DataRate, length: u64| {
+            let started = Instant::from_ticks(bench.now);
+            bench.run_ms(length / 1_000);
+            let mut of = bench.configuration.converter;
+            of.data_rate = rate;
+            let sample = ConverterSample {
+                started,
+                finished: Instant::from_ticks(bench.now),
+                configuration: of.expected_configuration(),
+                code: 1 << (rate.bits() - 2),
+            };
+            let history = bench.history();
+            bench
+                .measurement
+                .on_conversion(&bench.configuration, &sample, &history);
+        };
+        let nothing_raised = |bench: &Bench| {
+            let current = bench.measurement.current();
+            assert!(current.validity.is_valid(), "{old:?} {new:?}: {current:?}");
+            assert!(!bench.has(Code::ConverterConfigurationLost));
+            assert!(!bench.has(Code::ConverterStale));
+        };
+        let (slow, fast) = (old.period().as_ticks(), new.period().as_ticks());
+        for _ in 0..10 {
+            sample(&mut bench, old, slow);
+        }
+        nothing_raised(&bench);
+        // Half a conversion before the change, all of it after it.
+        bench.configuration.converter.data_rate = new;
+        bench
+            .measurement
+            .configuration_changed(&bench.configuration);
+        let current = bench.measurement.current().current;
+        sample(&mut bench, old, slow);
+        bench.run_ms(10);
+        nothing_raised(&bench);
+        assert_eq!(bench.measurement.current().current, current);
+        // The chip's first result of a new rate is discarded.
+        bench.run_ms(fast / 1_000);
+        nothing_raised(&bench);
+        for _ in 0..3 {
+            sample(&mut bench, new, fast);
+            bench.run_ms(10);
+            nothing_raised(&bench);
+        }
+        // A converter that is silent from the change on is found all the same.
+        bench.configuration.converter.data_rate = old;
+        bench
+            .measurement
+            .configuration_changed(&bench.configuration);
+        bench.run_ms((3 * slow + 3 * fast) / 1_000 + 20);
+        assert!(bench.has(Code::ConverterStale));
+    }
 }
 
 #[test]

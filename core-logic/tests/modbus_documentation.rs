@@ -132,8 +132,8 @@ fn settings_table() -> String {
             "| {} | {} | {} | {} | {} | 0x{:04X} |",
             text.name,
             text.unit,
-            grouped(row.min),
-            grouped(row.max),
+            grouped(row.limits().0),
+            grouped(row.limits().1),
             defaults(row),
             row.layout.address
         )

@@ -9,7 +9,7 @@ use anyhow::{Context as _, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 use toml::Spanned;
 
-use core_logic::configuration::{Configuration, FIELD_TEXTS, FIELDS, Field};
+use core_logic::configuration::{Configuration, FIELD_TEXTS, FIELDS};
 use core_logic::modbus::readings::{INPUT_TEXTS, INPUTS};
 use core_logic::modbus::register::{Kind, Layout};
 use core_logic::modbus::{COMMAND_ADDRESS, Command};
@@ -161,9 +161,9 @@ impl Entry {
             &["value"]
         };
         for (key, value) in keys.iter().zip(&values) {
-            let Field { min, max, .. } = field;
+            let (min, max) = field.limits();
             ensure!(
-                (min..=max).contains(&value),
+                (min..=max).contains(value),
                 "{name}: {key}: found {value}, expected {min} to {max} {}",
                 text.unit
             );

@@ -5,8 +5,9 @@ use core_logic::{
     configuration::Configuration,
     converter::ConverterSample,
     diagnosis::{Code, CodeSet},
+    gap::GapBridge,
     measurement::{ConverterFault, Environment, Found, Measurement, Vehicle},
-    meter::{GapBridge, MeterCalibration, MeterReport},
+    meter::{MeterCalibration, MeterReport},
     modbus::Readings,
     range::RangeHistory,
     retained::{RetainSlots, RetainedState},
@@ -227,7 +228,7 @@ impl Center {
             let (slot, bytes) = self.slots.write(&self.measurement.retained(0));
             retain::set_slot(slot, &bytes);
         }
-        link.bridge = self.measurement.bridge(&self.configuration);
+        link.bridge = self.measurement.bridge();
         self.ticks = self.ticks.wrapping_add(1);
         tick.hv_permit
     }

@@ -50,8 +50,9 @@ mod app {
         design_parameters,
         diagnosis::Code,
         front_end::Channel,
+        gap::GapBridge,
         measurement::{ConverterFault, Order},
-        meter::{GapBridge, MeterChannel, MeterReport},
+        meter::{MeterChannel, MeterReport},
         modbus::{Command, CommandState, Event, Readings},
         modbus_rtu::Server,
         retained::{RetainSlots, RetainedState, SavePolicy, SavePolicyConfig, Slot},
@@ -202,7 +203,7 @@ mod app {
                 temperature: None,
                 storms: 0,
                 latency_us: 0,
-                bridge: GapBridge::Unknown,
+                bridge: GapBridge::UNKNOWN,
                 calibration: None,
             },
             port: board.rs485,
@@ -321,11 +322,16 @@ mod app {
     /// range carry the old range's scale, 48 mC per 100 µs from 600 to 60 A, corrected by the known delay. The poll's
     /// deadline is 20 ms; nothing is lost before the accumulator is half full, 469 s.
     #[task(priority = 3, local = [meter], shared = [edges, meter_line, meter_link, line_storm])]
-    async fn meter_owner(mut cx: meter_owner::Context, charge: Option<Nanocoulombs>) {
+    async fn meter_owner(
+        mut cx: meter_owner::Context,
+        charge: Option<Nanocoulombs>,
+        started: Instant,
+    ) {
         let meter = cx.local.meter;
         let Some(mut wake) = METER_WAKE.try_take_reader() else {
             return;
         };
+        meter.channel().start(started);
         if let Some(charge) = charge {
             meter
                 .channel()
@@ -379,7 +385,10 @@ mod app {
             let mut worked = true;
             if edge && (core::mem::take(&mut bound) || meter.may_snapshot(now)) {
                 edge = false;
-                meter.snapshot(|at| cx.shared.edges.lock(|edges| edges.history(at)), bridge);
+                meter.snapshot(
+                    |at| cx.shared.edges.lock(|edges| edges.history(at)),
+                    &bridge,
+                );
                 publish(meter, &mut cx.shared.meter_link, edge_at.take());
             } else if verify {
                 verify = false;
@@ -401,7 +410,10 @@ mod app {
                 polls = polls.saturating_add(1);
                 fetch = polls.saturating_add(TEMPERATURE_AFTER_POLLS) == next_temperature;
                 if meter.is_counting() {
-                    meter.snapshot(|at| cx.shared.edges.lock(|edges| edges.history(at)), bridge);
+                    meter.snapshot(
+                        |at| cx.shared.edges.lock(|edges| edges.history(at)),
+                        &bridge,
+                    );
                 }
                 publish(meter, &mut cx.shared.meter_link, None);
                 alive(Task::Meter);
@@ -894,7 +906,7 @@ mod app {
             .lock(|link| link.calibration = calibration);
         defmt::info!("configuration {=u32:08x}, charge {}", crc, charge);
         // Each is spawned once, here.
-        let _ = meter_owner::spawn(charge);
+        let _ = meter_owner::spawn(charge, now);
         let _ = conversion::spawn();
         let _ = tick::spawn();
 
@@ -985,7 +997,7 @@ mod app {
             (Ok((state, slots)), _) => {
                 start.state = Some(state);
                 start.slots = slots;
-                start.loss = identity::loss_over_reset(previous);
+                start.loss = identity::loss_over_reset(previous, policy);
             }
             (Err(_), Stored::Value(state) | Stored::Older(state)) => {
                 start.state = Some(*state);

@@ -12,7 +12,8 @@ use ade7753::{
     registers::{Aenergy, Cfnum, Ch1os, Dierev, Gain, Mode, Status, Temp},
 };
 use core_logic::{
-    meter::{GapBridge, MeterChannel, MeterReading, MeterReport, ReadingOutcome, Rejection},
+    gap::GapBridge,
+    meter::{MeterChannel, MeterReading, MeterReport, ReadingOutcome, Rejection},
     range::RangeHistory,
     units::{Duration, Instant, MilliCelsius, clamp_i32, div_round, elapsed},
 };
@@ -212,7 +213,7 @@ impl Meter {
     pub fn snapshot(
         &mut self,
         mut history: impl FnMut(Instant) -> RangeHistory,
-        bridge: GapBridge,
+        bridge: &GapBridge,
     ) {
         for attempt in 0..ATTEMPTS {
             let started = time::now();

@@ -9,7 +9,7 @@ use crate::modbus::readings::Text;
 use crate::modbus::register::{Kind, Layout, Row};
 use crate::ocv::MAX_POINTS;
 use crate::soc::CAPACITY_LIMITS_MAH;
-use crate::units::{Microamps, Microvolts, MilliCelsius, Millivolts, Nanocoulombs, Ppm};
+use crate::units::{Microamps, Microvolts, MilliCelsius, Millivolts, Nanocoulombs, Ppm, clamp_i32};
 use crate::{converter, key_calibration, sliding_average, supply_calibration, zero_drift};
 
 /// The state of the board in which a setting may be written.
@@ -39,10 +39,9 @@ pub struct Field {
     pub layout: Layout,
     /// When a client may write it.
     pub when: When,
-    /// Smallest value.
-    pub min: i64,
-    /// Largest value.
-    pub max: i64,
+    /// Smallest and largest value; in millions for a value of 64 bits, so that a row keeps half the flash.
+    min: i32,
+    max: i32,
     /// Where an element is kept; one function for reading and writing, as there is one for every row. `None` when it
     /// belongs to another front end than the one set.
     place: fn(&mut Configuration, usize) -> Option<&mut dyn Setting>,
@@ -74,19 +73,27 @@ impl Field {
         (self.place)(configuration, element).map(|setting| setting.read())
     }
 
+    /// Smallest and largest value.
+    #[must_use]
+    pub const fn limits(&self) -> (i64, i64) {
+        let unit = limit_unit(self.layout.kind);
+        (self.min as i64 * unit, self.max as i64 * unit)
+    }
+
     /// Whether `value` lies in the limits of this field.
     ///
     /// # Errors
     /// [`Violation::OutOfLimits`] when it does not.
     pub fn check(&self, element: usize, value: i64) -> Result<(), Violation> {
-        if (self.min..=self.max).contains(&value) {
+        let (min, max) = self.limits();
+        if (min..=max).contains(&value) {
             Ok(())
         } else {
             Err(Violation::OutOfLimits {
                 field: self.id(element),
                 value,
-                min: self.min,
-                max: self.max,
+                min,
+                max,
             })
         }
     }
@@ -289,6 +296,21 @@ macro_rules! place {
     } };
 }
 
+/// In what a row keeps its limits.
+const fn limit_unit(kind: Kind) -> i64 {
+    match kind {
+        Kind::I64 => 1_000_000,
+        _ => 1,
+    }
+}
+
+/// A limit as a row keeps it; one that it cannot keep exactly does not compile.
+const fn limit(kind: Kind, value: i64) -> i32 {
+    let kept = clamp_i32(value / limit_unit(kind));
+    assert!(kept as i64 * limit_unit(kind) == value);
+    kept
+}
+
 macro_rules! fields {
     ($($address:literal $kind:ident $count:literal $when:ident ($min:expr, $max:expr)
         $name:literal $unit:literal $meaning:literal $access:tt;)*) => {
@@ -297,8 +319,8 @@ macro_rules! fields {
             $(Field {
                 layout: Layout { address: $address, kind: Kind::$kind, count: $count },
                 when: When::$when,
-                min: $min as i64,
-                max: $max as i64,
+                min: limit(Kind::$kind, $min as i64),
+                max: limit(Kind::$kind, $max as i64),
                 place: place!($access),
             },)*
         ];

@@ -8,8 +8,9 @@ use core_logic::can::{self, Frame};
 use core_logic::configuration::Configuration;
 use core_logic::converter::ConverterSample;
 use core_logic::diagnosis::CodeSet;
+use core_logic::gap::GapBridge;
 use core_logic::measurement::{Environment, Measurement, Tick, Vehicle};
-use core_logic::meter::{MeterChannel, MeterReading};
+use core_logic::meter::{MeterChannel, MeterReading, ReadingOutcome, Rejection};
 use core_logic::open_sensor::network_output;
 use core_logic::range::EdgeRecorder;
 use core_logic::units::{Duration, Instant, Microvolts, MilliCelsius, Millivolts, Nanocoulombs};
@@ -34,6 +35,10 @@ pub struct HostBoard<'a> {
     pub stuck_code: Option<i16>,
     /// AENERGY stands still.
     pub frozen: bool,
+    /// The meter does not answer in this time, in µs.
+    pub dead: core::ops::Range<u64>,
+    /// As of the newest tick: what the meter's owner has when it needs it.
+    bridge: GapBridge,
     energy: i32,
     /// The true charge at the first and at the newest reading of the meter, in C: between them it has counted.
     pub first_reading_c: Option<f64>,
@@ -73,6 +78,8 @@ impl<'a> HostBoard<'a> {
             external: CodeSet::EMPTY,
             stuck_code: None,
             frozen: false,
+            dead: 0..0,
+            bridge: GapBridge::UNKNOWN,
             energy: 0,
             first_reading_c: None,
             last_reading_c: 0.0,
@@ -95,6 +102,18 @@ impl<'a> HostBoard<'a> {
             }
             Event::Energy { at_us, counts } => {
                 self.now_us = at_us;
+                if self.dead.contains(&at_us) {
+                    // One that never counted is not lost: it has not begun.
+                    if self.meter.report().at.is_some() {
+                        self.meter.on_meter_lost();
+                    }
+                    self.measurement.on_meter(
+                        &self.configuration,
+                        &self.meter.report(),
+                        Validity::CHIP_FAULT,
+                    );
+                    return Some(Step::Event(event));
+                }
                 self.last_reading_c = self.world.charge_c;
                 self.first_reading_c.get_or_insert(self.world.charge_c);
                 let at = Instant::from_ticks(at_us);
@@ -105,7 +124,13 @@ impl<'a> HostBoard<'a> {
                     energy: self.energy,
                     at,
                 };
-                self.meter.on_reading(reading, self.edges.history(at));
+                let history = self.edges.history(at);
+                if let ReadingOutcome::Rejected(Rejection::Lost | Rejection::TooLate) =
+                    self.meter.on_reading(reading, history)
+                {
+                    self.meter
+                        .on_meter_restarted(reading, history, &self.bridge);
+                }
                 self.measurement.on_meter(
                     &self.configuration,
                     &self.meter.report(),
@@ -176,6 +201,7 @@ impl<'a> HostBoard<'a> {
         }
         self.meter
             .set_config(self.measurement.meter_config(&self.configuration));
+        self.bridge = self.measurement.bridge();
         tick
     }
 

@@ -152,3 +152,20 @@ fn fault_f24_the_board_is_back_after_a_hang_or_fault_with_its_charge_and_the_cau
     }
     assert!(beyond.is_empty(), "beyond what is declared: {beyond:?}");
 }
+
+/// The pin keeps RAM but may have been held for any time: as much is declared as after a loss of power.
+#[test]
+fn fault_f24_a_reset_by_the_pin_declares_the_bound_of_an_unknown_time() {
+    for (cause, declared_c) in [(ResetCause::Software, 360.0), (ResetCause::Pin, 960.0)] {
+        let mut rig = pulse(50.0, 3.0);
+        let before = charges_c(&mut rig);
+        rig.run_s(1.0).unwrap();
+        rig.machine.reset(cause);
+        rig.run_s(4.0).unwrap();
+        let (error_c, bound_c) = (charge_error_c(&mut rig, before), charge_bound_c(&rig));
+        println!("reset by {cause:?}: charge {error_c:+.2} C, declared {bound_c:.1} C");
+        assert_eq!(rig.view.charge_c().validity, 0);
+        assert!((bound_c - declared_c).abs() < 1.0, "{cause:?}: {bound_c}");
+        assert!(error_c.abs() < 50.0 * 0.6, "{cause:?}: {error_c}");
+    }
+}
