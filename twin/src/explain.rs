@@ -1426,10 +1426,6 @@ fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
             .map(|member| (member.id().to_owned(), values(member)))
             .collect(),
         nuisance: fit.model.nuisance,
-        initial_soc: match &problem.base {
-            Base::Battery(base) => base.initial_soc.first().copied(),
-            Base::Sensor(_) => None,
-        },
     }
 }
 

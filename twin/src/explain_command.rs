@@ -356,7 +356,7 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
                     .collect(),
             });
         }
-        shift.take(fitted.nuisance, fitted.initial_soc);
+        shift.take(fitted.nuisance);
     }
     model.extended(&found, shift, file.parent().unwrap_or(Path::new("")), out)
 }

@@ -242,33 +242,9 @@ fn what_the_sensor_is_off_by_does_not_hide_what_the_battery_is() {
             soc_shift,
             ..Nuisance::default()
         };
-        shift.take(found, Some(0.8));
+        shift.take(found);
     }
     assert_eq!((shift.alignment_s, shift.soc), (0.02, -0.03));
-}
-
-#[test]
-fn a_state_of_charge_that_was_not_stated_is_written_as_it_was_found() {
-    let text = "schema = 1\n[battery]\ncapacity_ah = 2\nocv = [[0, 3], [1, 4]]\n";
-    let here = Path::new(".");
-    let mut shift = Shift::default();
-    let found = Nuisance {
-        soc_shift: -0.05,
-        ..Nuisance::default()
-    };
-    shift.take(found, Some(0.8));
-    let written = parse(text)
-        .unwrap()
-        .extended(&[], shift, here, here)
-        .unwrap();
-    let soc = parse(&written)
-        .unwrap()
-        .battery
-        .unwrap()
-        .initial_soc
-        .unwrap();
-    assert!((soc - 0.75).abs() < 1e-12, "{written}");
-    assert!(written.contains("not stated"), "{written}");
 }
 
 #[test]

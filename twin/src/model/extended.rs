@@ -26,8 +26,6 @@ pub struct Found {
 pub struct Shift {
     /// Added to the initial state of charge, 0 … 1.
     pub soc: f64,
-    /// Initial state of charge that this is added to where the model file states none, 0 … 1.
-    pub from_soc: Option<f64>,
     /// Relative change of the ohmic resistance.
     pub resistance: f64,
     /// Time by which readings stand for an earlier moment than their row, in s.
@@ -36,10 +34,7 @@ pub struct Shift {
 
 impl Shift {
     /// What was found for one signal; of each value the first that says something counts.
-    pub fn take(&mut self, nuisance: Nuisance, initial_soc: Option<f64>) {
-        if self.soc == 0.0 && nuisance.soc_shift != 0.0 {
-            self.from_soc = initial_soc;
-        }
+    pub fn take(&mut self, nuisance: Nuisance) {
         for (mine, found) in [
             (&mut self.soc, nuisance.soc_shift),
             (&mut self.resistance, nuisance.resistance),
@@ -134,17 +129,17 @@ impl Extension<'_> {
         let Some(battery) = self.battery else {
             return;
         };
-        let from_soc = battery.initial_soc.or(self.shift.from_soc);
-        if let Some(soc) = from_soc.filter(|_| self.shift.soc != 0.0) {
+        // Where none is stated, each recording's first reading tells its own: one of this recording would be wrong for any other.
+        if let Some(soc) = battery.initial_soc.filter(|_| self.shift.soc != 0.0) {
             // Beyond 0 … 1 no model file may state it.
             let found = (soc + self.shift.soc).clamp(0.0, 1.0);
             set(table, "initial_soc", value(found));
-            was(table, "initial_soc", battery.initial_soc);
+            was(table, "initial_soc", soc);
         }
         if self.shift.resistance != 0.0 {
             let resistance = battery.resistance_ohm * (1.0 + self.shift.resistance);
             set(table, "ohmic_resistance_ohm", value(resistance));
-            was(table, "ohmic_resistance_ohm", Some(battery.resistance_ohm));
+            was(table, "ohmic_resistance_ohm", battery.resistance_ohm);
         }
     }
 }
@@ -162,14 +157,13 @@ fn set(table: &mut dyn TableLike, key: &str, mut new: Item) {
 }
 
 /// Says ahead of a value what was stated.
-fn was(table: &mut dyn TableLike, key: &str, stated: Option<f64>) {
-    let stated = stated.map_or("not stated".into(), |stated| format!("stated as {stated}"));
+fn was(table: &mut dyn TableLike, key: &str, stated: f64) {
     if let Some(mut key) = table.key_mut(key) {
         let decor = key.leaf_decor_mut();
         let before = decor.prefix().and_then(|prefix| prefix.as_str());
         let before = before.unwrap_or_default();
         decor.set_prefix(format!(
-            "{before}# Found by twin explain within its uncertainty; {stated}.\n"
+            "{before}# Found by twin explain within its uncertainty; stated as {stated}.\n"
         ));
     }
 }

@@ -67,8 +67,6 @@ pub struct FittedModel {
     pub effects: Vec<(String, Vec<(String, f64)>)>,
     /// What the base differs by, within what the model file says it does not know.
     pub nuisance: crate::effects::chain::Nuisance,
-    /// State of charge that a battery was taken to begin with, 0 … 1, as stated or from its first reading.
-    pub initial_soc: Option<f64>,
 }
 
 /// The files that the report is about.
