@@ -93,7 +93,9 @@ pub(super) fn item(
             reported
         };
         let slack_s = if spec.age_s > 0.0 { TICK_S } else { 0.0 };
-        let (later_s, reported) = phase::closest(0.0, (slack_s, 1), &observed, run);
+        let (tick_s, _) = phase::closest(0.0, (slack_s, 1), &observed, run);
+        // The jitter is a moment that nothing tells, and much the same all over a recording.
+        let (later_s, reported) = phase::settled(tick_s, 0.5 * spec.jitter_s, &observed, run);
         observed.t_s.iter_mut().for_each(|t| *t -= later_s);
         base.reading = reported.current_a;
         if drive.range_high.is_none() && board.has_two_ranges() {

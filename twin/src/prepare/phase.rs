@@ -28,6 +28,29 @@ pub(super) fn closest(
     best
 }
 
+/// What the board reports if its readings are later than stated by the time at which they fit best, within `slack_s` to either side
+/// of `later_s`, and that time in s. A shift this small moves a fit's error along a parabola, whose lowest point three trials tell.
+pub(super) fn settled(
+    later_s: f64,
+    slack_s: f64,
+    observed: &Observed,
+    run: impl Fn(f64) -> Reported,
+) -> (f64, Reported) {
+    let here = run(later_s);
+    if slack_s <= 0.0 {
+        return (later_s, here);
+    }
+    let middle = misfit(observed, &here);
+    let [before, after] =
+        [-slack_s, slack_s].map(|by_s| misfit(observed, &run(later_s + by_s)));
+    let bend = before + after - 2.0 * middle;
+    if bend.is_nan() || bend <= 0.0 {
+        return (later_s, here);
+    }
+    let lowest_s = later_s + slack_s * (0.5 * (before - after) / bend).clamp(-1.0, 1.0);
+    (lowest_s, run(lowest_s))
+}
+
 /// Mean square of what a straight line in each range leaves.
 fn misfit(observed: &Observed, reported: &Reported) -> f64 {
     let mut squares = Vec::new();
