@@ -51,6 +51,8 @@ const STRAY: f64 = 8.0;
 const STRAYS: usize = 2;
 /// Those readings are the mismatch if they make this share of its energy.
 const STRAYED: f64 = 0.5;
+/// So many in a row, all to one side, are the mismatch however little they make of it: something was there for a while.
+const IN_A_ROW: usize = 3;
 /// Where no noise is stated, a heavy tail is a noise of its own: there they have to be nearly all of it.
 const NEARLY_ALL: f64 = 0.9;
 /// From this correlation on, what is left sits where the named effects act: their shape is wrong.
@@ -284,6 +286,9 @@ fn one(
     report
         .remarks
         .extend(base_found(&problem.name, selection.fit.model.nuisance));
+    if verdict != Verdict::Unknown {
+        report.remarks.extend(slips(&read, &shown));
+    }
     report.plots.push(plots(&read, &shown, &held.read));
     let sentence = sentence(bench, &selection, (verdict, doubted), left, report);
     Part {
@@ -844,15 +849,16 @@ fn judge(
                 percent(before.placebo_most)
             ));
             Verdict::Unknown
-        } else if let Some(strays) = strays(bench, residual) {
+        } else if let Some(strays) = strays(bench, residual).filter(|strays| strays.decide) {
             selection.decisions.push(format!(
-                "No effect passes, yet {}, and not the others, are off by more than {STRAY} times {of}, by up to {} {}: unknown.",
+                "No effect passes, yet {} off by more than {STRAY} times {of}, and not the others, the worst by {} {} at {} s: unknown.",
                 match strays.count {
-                    1 => "one reading".to_owned(),
-                    count => format!("{count} readings"),
+                    1 => "one reading is".to_owned(),
+                    count => format!("{count} readings are"),
                 },
                 short(strays.largest),
-                bench.problem.unit
+                bench.problem.unit,
+                short(strays.at_s),
             ));
             Verdict::Unknown
         } else {
@@ -943,16 +949,20 @@ fn judge(
     }
 }
 
-/// Single readings that no stated noise makes.
+/// Readings that no stated noise makes.
 struct Strays {
     count: usize,
+    /// The largest of them, in the view's unit, and its time in s.
     largest: f64,
+    at_s: f64,
+    /// Whether they are the mismatch: most of it, or so many in a row that it is no slip of the log.
+    decide: bool,
 }
 
-/// Readings far beyond the stated noise, and what reference and time stamps are accurate to, if there are some and they make most of
-/// what is left.
+/// Readings far beyond the stated noise, and what reference and time stamps are accurate to, if there are some.
 fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
-    let (noise, least, share) = if bench.problem.noise > 0.0 {
+    let stated = bench.problem.noise > 0.0;
+    let (noise, least, share) = if stated {
         (bench.problem.noise, STRAYS, STRAYED)
     } else {
         // Of the changes from reading to reading the common ones: the strays are not to hide behind themselves.
@@ -963,16 +973,45 @@ fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
     if noise <= 0.0 {
         return None;
     }
-    let sizes: Vec<f64> = (0..bench.len())
+    let rows: Vec<usize> = (0..bench.len())
         .filter(|&row| residual[row].abs() > STRAY * noise + bench.accuracy(row))
-        .map(|row| residual[row].abs())
         .collect();
-    let energy: f64 = sizes.iter().map(|size| size * size).sum();
+    let largest = *rows
+        .iter()
+        .max_by(|a, b| residual[**a].abs().total_cmp(&residual[**b].abs()))?;
+    let energy: f64 = rows.iter().map(|&row| residual[row].powi(2)).sum();
     let all: f64 = residual.iter().map(|r| r * r).sum();
-    (sizes.len() >= least && energy > share * all).then(|| Strays {
-        count: sizes.len(),
-        largest: sizes.iter().fold(0.0, |most, size| most.max(*size)),
+    let in_a_row = rows
+        .chunk_by(|a, b| b - a == 1 && residual[*a] * residual[*b] > 0.0)
+        .map(<[usize]>::len)
+        .fold(0, usize::max);
+    Some(Strays {
+        count: rows.len(),
+        largest: residual[largest].abs(),
+        at_s: bench.t_s[largest],
+        decide: (rows.len() >= least && energy > share * all) || (stated && in_a_row >= IN_A_ROW),
     })
+}
+
+/// What is to be said of readings that no noise makes and that nothing accounts for, where they decide nothing.
+fn slips(read: &Workbench<'_>, shown: &Fit) -> Option<String> {
+    let strays = strays(read, &shown.residual).filter(|_| read.problem.noise > 0.0)?;
+    let of_what = if shown.model.members.is_empty() {
+        ""
+    } else {
+        " after all that is named"
+    };
+    Some(format!(
+        "{}: {} off by more than {STRAY} times the stated noise{of_what}, the worst by {} {} at {} s: a slip of the log, or something too rare here to name",
+        read.problem.name,
+        match strays.count {
+            1 => "one reading is".to_owned(),
+            count => format!("{count} readings are"),
+        },
+        short(strays.largest),
+        read.problem.unit,
+        short(strays.at_s),
+    ))
 }
 
 /// The least energy that the design lets be left: what is unavoidable, or the reference's own zero.

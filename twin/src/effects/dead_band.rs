@@ -38,9 +38,13 @@ impl Effect for DeadBand {
             return Vec::new();
         }
         sizes.sort_unstable_by(f64::total_cmp);
-        [0.01, 0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.3, 0.4, 0.5]
-            .map(|share| vec![sizes[(sizes.len() as f64 * share) as usize]])
-            .into_iter()
+        // A band that few readings are in is told by those few.
+        let few = [6, 12].map(|count| count.min(sizes.len() - 1));
+        let share = [0.01, 0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.3, 0.4, 0.5]
+            .map(|share| (sizes.len() as f64 * share) as usize);
+        few.into_iter()
+            .chain(share)
+            .map(|rank| vec![sizes[rank]])
             .filter(|start| start[0] > 0.0)
             .collect()
     }

@@ -1,5 +1,6 @@
 //! Robust least squares for the values of a model: Levenberg–Marquardt on Huber's loss, bounds kept, steps searched.
 
+use std::cmp::Ordering;
 use std::sync::{Arc, OnceLock};
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
@@ -25,6 +26,8 @@ const ELSEWHERE: [f64; 4] = [0.8, 0.9, 1.1, 1.25];
 const SHARES: [f64; 8] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5];
 /// So often from where the last of them led.
 const TIMES: usize = 4;
+/// Steps that are tried, in times of it, while a step changes nothing.
+const FARTHER: [f64; 3] = [1.0, 2.0, 4.0];
 /// The same for values that are moved together.
 const TOGETHER: [f64; 6] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4];
 /// The same for them.
@@ -771,19 +774,19 @@ impl Stepping<'_, '_, '_> {
         &self.here.model.members[self.member].values
     }
 
-    /// Goes to other values if they cost less.
-    fn goes_to(&mut self, values: Vec<f64>) -> bool {
+    /// Goes to other values if they cost less; what they cost against the present ones.
+    fn goes_to(&mut self, values: Vec<f64>) -> Ordering {
         let bench = self.aim.bench;
         let mut moved = self.here.model.clone();
         moved.members[self.member].values = values;
         let predicted = bench.go_on(&self.begun, &moved);
         let there = Point::of(bench, moved, predicted);
         let cost = self.aim.cost(&there.model, &there.residual);
-        let better = cost < self.cost;
-        if better {
+        let order = cost.partial_cmp(&self.cost).unwrap_or(Ordering::Greater);
+        if order.is_lt() {
             (*self.here, self.cost) = (there, cost);
         }
-        better
+        order
     }
 
     /// Where values depend on one another they are moved together.
@@ -817,7 +820,7 @@ impl Stepping<'_, '_, '_> {
                     if let Some((_, p)) = held {
                         values[p] = self.values()[p];
                     }
-                    found |= self.goes_to(values);
+                    found |= self.goes_to(values).is_lt();
                 }
                 if before - self.cost < WORTH {
                     break;
@@ -837,15 +840,21 @@ impl Stepping<'_, '_, '_> {
             for share in SHARES {
                 for _ in 0..TIMES {
                     let better = [1.0, -1.0].into_iter().any(|sign| {
-                        let mut values = self.values().to_vec();
-                        // A phase may be zero: it moves by shares of its period.
-                        let size = if values[p] == 0.0 {
-                            values[0]
-                        } else {
-                            values[p]
-                        };
-                        values[p] = (values[p] + sign * share * size).clamp(low, high);
-                        self.goes_to(values)
+                        // Where no reading lies between two values nothing changes: it may farther on.
+                        let mut reached = FARTHER.into_iter().map(|times| {
+                            let mut values = self.values().to_vec();
+                            // A phase may be zero: it moves by shares of its period.
+                            let size = if values[p] == 0.0 {
+                                values[0]
+                            } else {
+                                values[p]
+                            };
+                            values[p] = (values[p] + sign * times * share * size).clamp(low, high);
+                            self.goes_to(values)
+                        });
+                        reached
+                            .find(|order| order.is_ne())
+                            .is_some_and(Ordering::is_lt)
                     });
                     if !better {
                         break;

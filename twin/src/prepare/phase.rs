@@ -41,8 +41,7 @@ pub(super) fn settled(
         return (later_s, here);
     }
     let middle = misfit(observed, &here);
-    let [before, after] =
-        [-slack_s, slack_s].map(|by_s| misfit(observed, &run(later_s + by_s)));
+    let [before, after] = [-slack_s, slack_s].map(|by_s| misfit(observed, &run(later_s + by_s)));
     let bend = before + after - 2.0 * middle;
     if bend.is_nan() || bend <= 0.0 {
         return (later_s, here);
