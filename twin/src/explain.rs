@@ -432,7 +432,7 @@ impl Unfitted<'_> {
         let mismatch = self.bench.residual(&self.bench.plain);
         let left = self.bench.residual(&self.bench.run(&self.there(model)));
         let change: Vec<f64> = mismatch.iter().zip(&left).map(|(a, b)| a - b).collect();
-        let blocks: Vec<_> = self.bench.blocks.clone();
+        let blocks = &self.bench.blocks;
         let energy: f64 = blocks
             .iter()
             .map(|rows| fit::dot(&change[rows.clone()], &change[rows.clone()]))

@@ -132,16 +132,10 @@ fn fault_f03_a_stuck_miso_is_found_and_the_gap_is_bridged() {
     }
 }
 
-/// The current ends inside the gap: the mean of the conversions at its end would leave out all of it.
-#[test]
-fn fault_f03_what_flowed_in_a_long_gap_is_counted_by_the_converter() {
-    let mut rig = pulse(300.0, 2.0);
-    let before = charges_c(&mut rig);
-    rig.run_s(1.0).unwrap();
-    strike(&mut rig, "F3:low,2s");
-    rig.run_s(4.0).unwrap();
-    let (error_c, declared_c) = (charge_error_c(&mut rig, before), charge_bound_c(&rig));
-    println!("F3 for 2 s around a step: error {error_c:.3} C, declared {declared_c:.3} C");
+/// That a gap of 2 s with a step to or from 300 A in it is counted by the converter, said to be, and declared.
+fn gap_is_counted(rig: &mut emulator::rig::Rig<'_>, before: (f64, f64), gap: &str) {
+    let (error_c, declared_c) = (charge_error_c(rig, before), charge_bound_c(rig));
+    println!("F3 for 2 s {gap}: error {error_c:.3} C, declared {declared_c:.3} C");
     assert_eq!(rig.view.charge_c().validity, 0);
     assert_eq!(rig.view.signal("Charge", "ChargeEstimated"), Some(1.0));
     assert!(error_c.abs() <= declared_c, "{error_c}, {declared_c}");
@@ -152,6 +146,17 @@ fn fault_f03_what_flowed_in_a_long_gap_is_counted_by_the_converter() {
     );
 }
 
+/// The current ends inside the gap: the mean of the conversions at its end would leave out all of it.
+#[test]
+fn fault_f03_what_flowed_in_a_long_gap_is_counted_by_the_converter() {
+    let mut rig = pulse(300.0, 2.0);
+    let before = charges_c(&mut rig);
+    rig.run_s(1.0).unwrap();
+    strike(&mut rig, "F3:low,2s");
+    rig.run_s(4.0).unwrap();
+    gap_is_counted(&mut rig, before, "around a step");
+}
+
 /// Dead from power-on: what flows until it counts is a gap as well.
 #[test]
 fn fault_f03_a_meter_dead_from_the_start_has_its_gap_counted_and_declared() {
@@ -159,15 +164,7 @@ fn fault_f03_a_meter_dead_from_the_start_has_its_gap_counted_and_declared() {
     rig.run_s(1.0).unwrap();
     assert_ne!(rig.view.charge_c().validity, 0);
     rig.run_s(4.0).unwrap();
-    let (error_c, declared_c) = (charge_error_c(&mut rig, (0.0, 0.0)), charge_bound_c(&rig));
-    println!("F3 for 2 s from the start: error {error_c:.3} C, declared {declared_c:.3} C");
-    assert_eq!(rig.view.charge_c().validity, 0);
-    assert_eq!(rig.view.signal("Charge", "ChargeEstimated"), Some(1.0));
-    assert!(error_c.abs() <= declared_c, "{error_c}, {declared_c}");
-    assert!(
-        error_c.abs() < 15.0 && declared_c < 150.0,
-        "{error_c}, {declared_c}"
-    );
+    gap_is_counted(&mut rig, (0.0, 0.0), "from the start");
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Where the mismatch sits: the stretch of time, the operating region and the band of frequency that hold more of its energy
-//! than of the samples, each with a p-value: of time and region from block permutation, of frequency from the noise that the model
-//! file states, or from rows in any order where it states no memory.
+//! than of the samples, each with a p-value: of time from permuted blocks, of a region from the recording moved against it, of
+//! frequency from the noise that the model file states, or from rows in any order where it states no memory.
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
@@ -338,8 +338,7 @@ fn stretch(
 }
 
 fn band(bench: &Workbench<'_>, residual: &[f64], random: &mut ChaCha8Rng) -> Option<Location> {
-    let spectrum = |residual: &[f64]| bands(bench, residual);
-    let here = spectrum(residual);
+    let here = bands(bench, residual);
     let total: f64 = here.iter().map(|(_, _, energy)| energy).sum();
     let width = here.last().map(|(_, to, _)| *to)? - here.first().map(|(from, _, _)| *from)?;
     if !(total > 0.0 && width > 0.0) {
@@ -376,7 +375,7 @@ fn band(bench: &Workbench<'_>, residual: &[f64], random: &mut ChaCha8Rng) -> Opt
                     drawn.swap(k, (random.next_u64() % (k as u64 + 1)) as usize);
                 }
             }
-            best(&spectrum(&drawn)).0 >= tells
+            best(&bands(bench, &drawn)).0 >= tells
         })
         .count();
     let p_value = (above + 1) as f64 / f64::from(draws + 1);
@@ -409,10 +408,13 @@ pub fn energy_in_band(bench: &Workbench<'_>, location: &Location, series: &[f64]
         location.from.unwrap_or(0.0),
         location.to.unwrap_or(f64::INFINITY),
     );
+    // Of a band that the place only reaches into, its part: the density is taken as even within a band.
     bands(bench, series)
         .into_iter()
-        .filter(|band| band.0 >= from && band.1 <= to)
-        .map(|band| band.2)
+        .map(|(low, high, energy)| {
+            let shared = high.min(to) - low.max(from);
+            energy * (shared / (high - low)).clamp(0.0, 1.0)
+        })
         .sum()
 }
 
