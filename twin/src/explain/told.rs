@@ -1,0 +1,311 @@
+//! What the report says of one signal: its effects, its places, its plots and its sentence.
+
+use super::fit::Fit;
+use super::flexible::Explainable;
+use super::select::{Selection, percent};
+use super::workbench::{Member, Workbench};
+use super::{Nuisance, intervals, locate};
+use crate::effects::find;
+use crate::problem::Problem;
+use crate::report::data::{
+    EffectReport, FittedModel, Location, LocationKind, ParameterReport, Report, SignalPlots,
+    Verdict,
+};
+use crate::spectrum;
+
+/// What a battery is found to be off by is told from here on, in %.
+const TOLD_PERCENT: f64 = 0.1;
+/// Share of what is in a band of frequency from which on an effect reaches it.
+const REACHES: f64 = 0.1;
+
+/// Which effect accounts for each place: the one that changes the reading most there.
+pub(super) fn attribute(bench: &Workbench<'_>, fit: &Fit, locations: &mut [Location]) {
+    if fit.model.members.is_empty() || locations.is_empty() {
+        return;
+    }
+    let changes: Vec<(&'static str, Vec<f64>)> = (0..fit.model.members.len())
+        .map(|index| {
+            let without = bench.run(&fit.model.without(index));
+            let change = fit
+                .predicted
+                .iter()
+                .zip(without)
+                .map(|(with, without)| with - without)
+                .collect();
+            (fit.model.members[index].id(), change)
+        })
+        .collect();
+    let variables = locate::variables(bench);
+    for location in locations {
+        if location.kind == LocationKind::Frequency {
+            let energy = |change: &[f64]| locate::energy_in_band(bench, location, change);
+            let there = energy(&fit.residual) + changes.iter().map(|(_, c)| energy(c)).sum::<f64>();
+            // An effect that hardly reaches a band is not why it stands out.
+            location.effect = changes
+                .iter()
+                .map(|(id, change)| (*id, energy(change)))
+                .filter(|(_, energy)| *energy > REACHES * there)
+                .max_by(|a, b| a.1.total_cmp(&b.1))
+                .map(|(id, _)| id.to_owned());
+            continue;
+        }
+        let here: Vec<usize> = (0..bench.len())
+            .filter(|&row| locate::within(bench, location, &variables, row).unwrap_or(true))
+            .collect();
+        location.effect = changes
+            .iter()
+            .map(|(id, change)| {
+                (
+                    *id,
+                    here.iter()
+                        .map(|&row| change[row].powi(2))
+                        .filter(|c| c.is_finite())
+                        .sum::<f64>(),
+                )
+            })
+            .max_by(|a, b| a.1.total_cmp(&b.1))
+            .map(|(id, _)| id.to_owned());
+    }
+}
+
+/// The unit of a parameter in this problem: `A` in the effects table stands for the view's unit.
+pub(super) fn unit(problem: &Problem, unit: &str) -> String {
+    match problem.view {
+        crate::problem::View::Sensor if problem.unit != "A" => unit.replace('A', &problem.unit),
+        _ => unit.to_owned(),
+    }
+}
+
+pub(super) fn effects(
+    bench: &Workbench<'_>,
+    selection: &Selection,
+    beside: f64,
+) -> Vec<EffectReport> {
+    let intervals = intervals::intervals(bench, &selection.fit, beside);
+    selection
+        .named
+        .iter()
+        .map(|named| {
+            let member = &selection.fit.model.members[named.index];
+            let card = member.effect.card();
+            let parameters = card
+                .parameters
+                .iter()
+                .enumerate()
+                .filter(|(_, parameter)| !parameter.internal)
+                .map(|(p, parameter)| {
+                    let value = member.values[p];
+                    let [from, to] = intervals[named.index][p];
+                    // What has no sign has none in its interval; other bounds are those of the search.
+                    let unsigned = member.effect.bounds(p, &bench.scale).0 == 0.0 && value >= 0.0;
+                    ParameterReport {
+                        name: parameter.name.to_owned(),
+                        value,
+                        ci95: [if unsigned { from.max(0.0) } else { from }, to],
+                        off: Some(parameter.off).filter(|off| off.is_finite()),
+                        unit: unit(bench.problem, parameter.unit),
+                    }
+                })
+                .collect();
+            let separated: Vec<&str> = named
+                .equivalent
+                .iter()
+                .filter_map(|id| find(id))
+                .map(|effect| effect.card().separated_by)
+                .chain((!named.equivalent.is_empty()).then_some(card.separated_by))
+                .collect();
+            EffectReport {
+                id: card.id.to_owned(),
+                signal: bench.problem.name.clone(),
+                statement: statement(card.statement, &bench.problem.unit),
+                equation: card.equation.to_owned(),
+                parameters,
+                held_out_gain: named.held_out_gain,
+                placebo_p99: named.placebo_p99,
+                equivalent_to: named.equivalent.iter().map(|id| (*id).to_owned()).collect(),
+                separated_by: separated.join("; or "),
+                consequences: member.effect.consequences(&member.values, bench.problem),
+            }
+        })
+        .collect()
+}
+
+/// What an effect does, in words of the signal's unit: the library is written for currents.
+fn statement(of_currents: &str, unit: &str) -> String {
+    if unit == "A" {
+        of_currents.to_owned()
+    } else {
+        of_currents.replace("every current", "every value")
+    }
+}
+
+pub(super) fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> SignalPlots {
+    let step = bench.scale.reading_step_s;
+    let plain = bench.residual(&bench.plain);
+    let before = spectrum::density(&bench.t_s, &plain, step, 60);
+    let after = spectrum::density(&bench.t_s, &fit.residual, step, 60);
+    SignalPlots {
+        name: bench.problem.name.clone(),
+        unit: bench.problem.unit.clone(),
+        t_s: bench.t_s.clone(),
+        recorded: bench.y.clone(),
+        before: bench.plain.clone(),
+        after: fit.predicted.clone(),
+        reference: bench.reference.clone(),
+        held_out_residual: held_residual.to_vec(),
+        variables: locate::variables(bench)
+            .into_iter()
+            .map(|variable| {
+                (
+                    format!("{} / {}", variable.name, variable.unit),
+                    variable.values,
+                )
+            })
+            .collect(),
+        spectrum: before
+            .iter()
+            .zip(&after)
+            .map(|(before, after)| (0.5 * (before.0 + before.1), before.2, after.2))
+            .collect(),
+    }
+}
+
+pub(super) fn sentence(
+    bench: &Workbench<'_>,
+    selection: &Selection,
+    (verdict, doubted): (Verdict, bool),
+    left: Explainable,
+    report: &Report,
+) -> String {
+    let name = &bench.problem.name;
+    let ids: Vec<String> = selection
+        .named
+        .iter()
+        .map(|named| {
+            let id = selection.fit.model.members[named.index].id();
+            if named.equivalent.is_empty() {
+                id.to_owned()
+            } else {
+                format!("{id} (or {})", named.equivalent.join(", "))
+            }
+        })
+        .collect();
+    let figures = report.signals.last().map_or(String::new(), |signal| {
+        format!(
+            "held-out error {} → {} {}",
+            short(signal.held_out_blocks_before),
+            short(signal.held_out_blocks_after),
+            signal.unit
+        )
+    });
+    match verdict {
+        Verdict::NoMismatch => format!(
+            "{name}: recording and simulation agree; nothing is left that any effect explains better than chance."
+        ),
+        Verdict::Explained => format!("{name}: explained by {} ({figures}).", ids.join(" and ")),
+        Verdict::PartlyExplained => format!(
+            "{name}: partly explained by {} ({figures}); {}.",
+            ids.join(" and "),
+            if left.is_real() {
+                format!(
+                    "structure is left, {} of it within reach of the recorded inputs",
+                    percent(left.share)
+                )
+            } else {
+                "what remains is louder than the stated noise".to_owned()
+            }
+        ),
+        Verdict::Ambiguous if doubted => format!(
+            "{name}: explained best by {} ({figures}), but not certainly: another physics of much the same shape may be behind it.",
+            ids.join(" and ")
+        ),
+        Verdict::Ambiguous => format!(
+            "{name}: explained by {} ({figures}); this recording cannot tell them apart.",
+            ids.join(" and ")
+        ),
+        Verdict::Unknown => format!(
+            "{name}: there is a mismatch, and no effect of the library accounts for it ({figures})."
+        ),
+    }
+}
+
+/// What was found of a battery within what the model file leaves open: it is no physics that was left out, and part of every error
+/// after it.
+pub(super) fn base_found(name: &str, nuisance: Nuisance) -> Option<String> {
+    let by = |share: f64, what: &str, unit: &str| {
+        let percent = 100.0 * share;
+        let way = if percent > 0.0 { "higher" } else { "lower" };
+        (percent.abs() >= TOLD_PERCENT)
+            .then(|| format!("{what} {} {unit} {way}", short(percent.abs())))
+    };
+    let start = "the state of charge at the start";
+    let found: Vec<String> = [
+        by(nuisance.resistance, "the ohmic resistance", "%"),
+        by(nuisance.soc_shift, start, "points of per cent"),
+    ]
+    .into_iter()
+    .flatten()
+    .collect();
+    (!found.is_empty()).then(|| {
+        format!(
+            "{name}: within what the model file leaves open, {} than stated fits; the errors after are with that",
+            found.join(" and ")
+        )
+    })
+}
+
+pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
+    let values = |member: &Member| {
+        let names = member
+            .effect
+            .card()
+            .parameters
+            .iter()
+            .map(|parameter| parameter.name.to_owned());
+        names.zip(member.values.iter().copied()).collect()
+    };
+    FittedModel {
+        signal: problem.name.clone(),
+        effects: fit
+            .model
+            .members
+            .iter()
+            .map(|member| (member.id().to_owned(), values(member)))
+            .collect(),
+        nuisance: fit.model.nuisance,
+    }
+}
+
+/// Three digits.
+pub(super) fn short(value: f64) -> String {
+    if value == 0.0 || !value.is_finite() {
+        return format!("{value}");
+    }
+    let digits = 2 - value.abs().log10().floor() as i32;
+    format!("{value:.*}", digits.clamp(0, 12) as usize)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_battery_was_off_by_is_told_if_it_matters() {
+        let found = |resistance, soc_shift| {
+            let nuisance = Nuisance {
+                resistance,
+                soc_shift,
+                ..Nuisance::default()
+            };
+            base_found("v_cell_v", nuisance)
+        };
+        assert_eq!(found(4e-4, -4e-4), None);
+        let said = found(0.273, -0.0071).unwrap();
+        assert!(said.contains("resistance 27.3 % higher and"), "{said}");
+        assert!(
+            said.contains("start 0.710 points of per cent lower"),
+            "{said}"
+        );
+    }
+}

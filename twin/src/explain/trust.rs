@@ -1,0 +1,290 @@
+//! Names that are taken back: effects whose values waver, or that the recording does not tell.
+
+use super::fit::{self, Fit};
+use super::intervals::{self, Variation};
+use super::select::{self, Selection, percent};
+use super::told::short;
+use super::unfitted::{Unfitted, confirmed};
+use super::workbench::{Member, Model, Workbench};
+use crate::effects::scene::Scale;
+use crate::effects::{IDEALISED, Search, find};
+use crate::problem::Base;
+
+/// An effect whose values would have to differ from stretch to stretch by so many times what equations may be off by (14 % of it,
+/// rms, of a sensor's; 28 % of a battery's) is not what is there: true ones of other people's circuits and cells stay below.
+pub(super) const WAVERS: f64 = 2.8;
+/// An interval whose ends differ by this factor says nothing.
+const VAGUE: f64 = 100.0;
+/// Starts of an effect that are fitted in another's place; of more the nearest.
+const STAND_INS: usize = 12;
+
+/// Whether values would have to differ from stretch to stretch by more than noise makes them, and by much.
+pub(super) fn waver(bench: &Workbench<'_>, member: &Member, variation: &Variation) -> bool {
+    variation.deviations > select::CERTAIN
+        && variation.share > (WAVERS * roughness(bench, member)).powi(2)
+}
+
+/// What an effect's equation may be off by, as a share of its change, rms.
+pub(super) fn roughness(bench: &Workbench<'_>, member: &Member) -> f64 {
+    // Without relaxation and charge transfer the battery as designed is rougher than a sensor.
+    let base = match bench.problem.base {
+        Base::Sensor(_) => IDEALISED,
+        Base::Battery(_) => 2.0 * IDEALISED,
+    };
+    member.effect.idealised().max(base)
+}
+
+/// Takes effects out again whose values would have to differ from stretch to stretch by more than noise makes them; true if there
+/// were any.
+pub(super) fn wavering(
+    bench: &Workbench<'_>,
+    selection: &mut Selection,
+    others: &[Unfitted<'_>],
+) -> bool {
+    let mut refused: Vec<&'static str> = Vec::new();
+    while !selection.named.is_empty() && !confirmed(selection, others) {
+        let members = &selection.fit.model.members;
+        let found = intervals::variations(bench, &selection.fit)
+            .into_iter()
+            .enumerate()
+            .filter(|(index, variation)| waver(bench, &members[*index], variation))
+            .max_by(|a, b| a.1.share.total_cmp(&b.1.share));
+        let Some((index, variation)) = found else {
+            break;
+        };
+        let id = members[index].id();
+        // What was refused once does not come back in another's place: else two could take turns for ever.
+        refused.push(id);
+        selection.refused.push(format!(
+            "{id}: fits, but its values would have to differ by {} from stretch to stretch, {:.0} standard deviations more than noise: what is there is not constant",
+            percent(variation.share.sqrt()),
+            variation.deviations
+        ));
+        let steady = |fit: &Fit| {
+            let last = intervals::variations(bench, fit);
+            let last = last.last().zip(fit.model.members.last());
+            last.is_some_and(|(variation, member)| !waver(bench, member, variation))
+        };
+        replace(
+            bench,
+            selection,
+            index,
+            ("its values stay", &refused),
+            &steady,
+        );
+    }
+    !refused.is_empty()
+}
+
+/// Takes effects out again whose values the recording does not tell; where others would do as well, the best of those whose
+/// values it does tell takes the place.
+pub(super) fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
+    let mut refused: Vec<&'static str> = Vec::new();
+    while !selection.named.is_empty() {
+        let intervals = intervals::intervals(bench, &selection.fit, 0.0);
+        let members = &selection.fit.model.members;
+        let found =
+            members
+                .iter()
+                .zip(&intervals)
+                .enumerate()
+                .find_map(|(index, (member, intervals))| {
+                    Some((index, untold(&bench.scale, member, intervals)?))
+                });
+        let Some((index, why)) = found else {
+            return;
+        };
+        let id = members[index].id();
+        refused.push(id);
+        selection.refused.push(format!(
+            "{id}: fits, but this recording does not tell its values: {why}"
+        ));
+        replace(
+            bench,
+            selection,
+            index,
+            ("the recording tells its values", &refused),
+            &|_| true,
+        );
+    }
+}
+
+/// Takes an effect out of the model, or puts the best of its equals of which something holds in its place.
+fn replace(
+    bench: &Workbench<'_>,
+    selection: &mut Selection,
+    index: usize,
+    (why, refused): (&str, &[&'static str]),
+    holds: &dyn Fn(&Fit) -> bool,
+) {
+    let id = selection.fit.model.members[index].id();
+    let holds = |fit: &Fit| {
+        let last = fit.model.members.last();
+        last.is_none_or(|member| !refused.contains(&member.id())) && holds(fit)
+    };
+    let without = fit::fit(bench, &selection.fit.model.without(index), None);
+    match stand_in(bench, selection, &without.model, index, &holds) {
+        Some(better) => {
+            selection.decisions.push(format!(
+                "{} instead of {id}: as good, and {why}.",
+                better.model.members.last().map_or("", Member::id)
+            ));
+            selection.take(index, better);
+        }
+        None => selection.fit = fit::polish(bench, &without),
+    }
+    selection.rename(bench);
+}
+
+/// The best of what would have done as well in the place of an effect that was taken out, if the recording tells its values.
+fn stand_in(
+    bench: &Workbench<'_>,
+    selection: &Selection,
+    without: &Model,
+    index: usize,
+    holds: &dyn Fn(&Fit) -> bool,
+) -> Option<Fit> {
+    let named = selection.named.iter().find(|one| one.index == index)?;
+    let as_read = bench.as_read(&selection.fit.predicted);
+    let clues = bench.clues(&as_read);
+    let mut fits: Vec<Fit> = named
+        .equivalent
+        .iter()
+        .filter(|id| !without.has(id))
+        .filter_map(|id| find(id))
+        .flat_map(|effect| {
+            let starts = effect.starts(&bench.scale, &clues).into_iter();
+            let models = starts.map(|values| without.with(Member { effect, values }));
+            nearest(bench, models.collect())
+        })
+        .map(|model| fit::fit(bench, &model, None))
+        .collect();
+    // In one spread for all: in its own, a bad fit's residual is a small one.
+    let sigma = fits
+        .iter()
+        .fold(selection.fit.sigma, |least, fit| least.min(fit.sigma));
+    let loss = |fit: &Fit| fit::loss(&fit.residual, sigma);
+    fits.sort_by(|a, b| loss(a).total_cmp(&loss(b)));
+    let found = fits.into_iter().find(|fit| {
+        let last = fit.model.members.len() - 1;
+        let member = &fit.model.members[last];
+        select::at_end(bench, member).is_none()
+            && untold(
+                &bench.scale,
+                member,
+                &intervals::intervals(bench, fit, 0.0)[last],
+            )
+            .is_none()
+            && holds(fit)
+            && !select::beaten(bench, fit, &selection.fit)
+    });
+    found.map(|fit| fit::polish(bench, &fit))
+}
+
+/// Of many models the nearest to the readings as they are.
+fn nearest(bench: &Workbench<'_>, models: Vec<Model>) -> Vec<Model> {
+    if models.len() <= STAND_INS {
+        return models;
+    }
+    let mut ranked: Vec<(f64, Model)> = models
+        .into_iter()
+        .map(|model| {
+            let residual = bench.residual(&bench.run(&model));
+            (residual.iter().map(|r| r.abs()).sum(), model)
+        })
+        .collect();
+    ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let nearest = ranked.into_iter().take(STAND_INS);
+    nearest.map(|(_, model)| model).collect()
+}
+
+/// Why the recording does not tell an effect's values: an interval over orders of magnitude or over all that is physics, or
+/// every size that the effect has could as well be none.
+fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<String> {
+    let parameters = member.effect.card().parameters;
+    let known = || {
+        parameters
+            .iter()
+            .zip(intervals)
+            .enumerate()
+            .filter(|(_, (parameter, _))| !parameter.internal)
+    };
+    // Where one size is told (a knee), another (how soft it is) need not be.
+    let mut sizes = known()
+        .filter(|(_, (parameter, _))| parameter.search == Search::Logarithmic)
+        .map(|(_, (_, [low, high]))| *high > VAGUE * low)
+        .peekable();
+    let vague = sizes.peek().is_some() && sizes.all(|vague| vague);
+    for (index, (parameter, [low, high])) in known() {
+        let (lowest, highest) = member.effect.bounds(index, scale);
+        let magnitudes = vague && parameter.search == Search::Logarithmic;
+        let whole = !parameter.open && !parameter.to_top && low <= &lowest && high >= &highest;
+        if magnitudes || whole {
+            return Some(format!(
+                "{} could be {} … {}",
+                parameter.name,
+                short(*low),
+                short(*high)
+            ));
+        }
+    }
+    let sizes: Vec<_> = known()
+        .filter(|(_, (parameter, _))| {
+            parameter.search == Search::Linear && parameter.off.is_finite()
+        })
+        .collect();
+    let none = |(parameter, [low, high]): (&crate::effects::Parameter, &[f64; 2])| {
+        (*low..=*high).contains(&parameter.off)
+    };
+    (!sizes.is_empty() && sizes.iter().all(|(_, pair)| none(*pair))).then(|| {
+        format!(
+            "{} could as well be {}",
+            sizes[0].1.0.name,
+            short(sizes[0].1.0.off)
+        )
+    })
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_recording_does_not_tell_is_told_from_what_it_does() {
+        let scale = Scale {
+            full_scale: 600.0,
+            largest: 400.0,
+            rms: 100.0,
+            step_s: 0.1,
+            reading_step_s: 0.1,
+            span_s: 1000.0,
+            capacity_ah: 50.0,
+            ..Scale::default()
+        };
+        let says = |id: &str, intervals: &[[f64; 2]]| {
+            let effect = find(id).unwrap();
+            let values = intervals.iter().map(|[low, high]| 0.5 * (low + high));
+            let member = Member {
+                effect,
+                values: values.collect(),
+            };
+            untold(&scale, &member, intervals)
+        };
+        assert_eq!(says("offset", &[[0.1, 0.3]]), None);
+        assert!(
+            says("offset", &[[-0.1, 0.3]])
+                .unwrap()
+                .contains("offset_a could as well be 0")
+        );
+        // One size is enough.
+        assert_eq!(says("range-mismatch", &[[1.01, 1.02], [-0.1, 0.1]]), None);
+        assert!(says("range-mismatch", &[[0.99, 1.02], [-0.1, 0.1]]).is_some());
+        assert!(says("coulombic-efficiency", &[[-1.0, 12.0]]).is_some());
+        assert_eq!(says("coulombic-efficiency", &[[0.97, 0.99]]), None);
+        assert_eq!(says("lag", &[[0.1, 0.4]]), None);
+        assert!(says("lag", &[[0.01, 2.0]]).unwrap().contains("tau_s"));
+        assert!(says("ocv-hysteresis", &[[-3.0, 1.8], [1e-6, 1e-5]]).is_some());
+        assert_eq!(says("ocv-hysteresis", &[[0.01, 0.02], [60.0, 300.0]]), None);
+    }
+}

@@ -1,0 +1,201 @@
+//! What files that were never fitted say of the effects.
+
+use std::path::Path;
+
+use super::fit;
+use super::told::short;
+use super::trust::{WAVERS, roughness};
+use super::workbench::{Model, Workbench};
+use super::{Holdout, Nuisance, Selection, rms, select};
+use crate::report::data::HoldoutReport;
+
+/// An effect that makes the error in another file larger by this factor is not that file's physics.
+const WORSE: f64 = 1.05;
+/// A file that was never fitted confirms the effects if they bring its error down to this share.
+const CONFIRMED: f64 = 0.6;
+/// Places in a turn that are tried for a file that was never fitted.
+const PHASES: f64 = 24.0;
+
+/// A file that was never fitted, ready to be predicted.
+pub(super) struct Unfitted<'a> {
+    file: &'a Path,
+    bench: Workbench<'a>,
+}
+
+impl<'a> Unfitted<'a> {
+    /// Every such file that has a signal.
+    pub(super) fn all(holdouts: &'a [Holdout], signal: &str) -> Vec<Self> {
+        let problems = holdouts
+            .iter()
+            .flat_map(|holdout| holdout.problems.iter().map(move |other| (holdout, other)));
+        problems
+            .filter(|(_, other)| other.name == signal)
+            .map(|(holdout, other)| Self {
+                file: &holdout.file,
+                bench: Workbench::new(other, &[]),
+            })
+            .collect()
+    }
+
+    /// Its line in the report.
+    pub(super) fn report(&self, model: &Model) -> HoldoutReport {
+        HoldoutReport {
+            file: self.file.display().to_string(),
+            signal: self.bench.problem.name.clone(),
+            rmse_before: self.rmse_before(),
+            rmse_after: self.rmse(model),
+        }
+    }
+
+    /// Error with a model.
+    fn rmse(&self, model: &Model) -> f64 {
+        let predicted = self.bench.run(&self.there(model));
+        rms(self.bench.residual(&predicted).into_iter())
+    }
+
+    /// The model as it is taken to this file: how a file starts, and where in a turn, is its own; the physics is not.
+    fn there(&self, model: &Model) -> Model {
+        let mut model = elsewhere(model);
+        let error = |model: &Model| rms(self.bench.residual(&self.bench.run(model)).into_iter());
+        for m in 0..model.members.len() {
+            let member = &model.members[m];
+            let internal = member.effect.card().parameters.iter();
+            let Some(p) = internal.clone().position(|parameter| parameter.internal) else {
+                continue;
+            };
+            let Some(turn) = member.effect.turn(&member.values) else {
+                continue;
+            };
+            let mut best = (error(&model), member.values[p]);
+            for step in [1.0, 0.25, 0.0625].map(|share| share * turn / PHASES) {
+                let around = best.1;
+                for k in 0..PHASES as i32 {
+                    let mut tried = model.clone();
+                    tried.members[m].values[p] = around + (f64::from(k) - 0.5 * PHASES) * step;
+                    let there = error(&tried);
+                    if there < best.0 {
+                        best = (there, tried.members[m].values[p]);
+                    }
+                }
+            }
+            model.members[m].values[p] = best.1;
+        }
+        model
+    }
+
+    /// Error as designed.
+    fn rmse_before(&self) -> f64 {
+        rms(self.bench.residual(&self.bench.plain).into_iter())
+    }
+
+    /// How many times the change that a model makes here is in this file's mismatch, and the standard error of that: regression of
+    /// the one on the other, blocks as clusters (Liang and Zeger 1986). 1 is what a true effect has; `None` without a change.
+    fn times_there(&self, model: &Model) -> Option<(f64, f64)> {
+        let mismatch = self.bench.residual(&self.bench.plain);
+        let left = self.bench.residual(&self.bench.run(&self.there(model)));
+        let change: Vec<f64> = mismatch.iter().zip(&left).map(|(a, b)| a - b).collect();
+        let blocks = &self.bench.blocks;
+        let energy: f64 = blocks
+            .iter()
+            .map(|rows| fit::dot(&change[rows.clone()], &change[rows.clone()]))
+            .sum();
+        if blocks.len() < 2 || energy <= 0.0 {
+            return None;
+        }
+        let along: f64 = blocks
+            .iter()
+            .map(|rows| fit::dot(&change[rows.clone()], &mismatch[rows.clone()]))
+            .sum();
+        let times = along / energy;
+        let scatter: f64 = blocks
+            .iter()
+            .map(|rows| {
+                let of_block = rows
+                    .clone()
+                    .map(|row| change[row] * (mismatch[row] - times * change[row]));
+                of_block.sum::<f64>().powi(2)
+            })
+            .sum();
+        let count = blocks.len() as f64;
+        Some((times, (scatter * count / (count - 1.0)).sqrt() / energy))
+    }
+}
+
+/// The model as it is taken to another file: how a file starts is its own, the physics is not.
+fn elsewhere(model: &Model) -> Model {
+    Model {
+        nuisance: Nuisance {
+            soc_shift: 0.0,
+            ..model.nuisance
+        },
+        ..model.clone()
+    }
+}
+
+/// What files that were never fitted say against the effects: the share, in energy, of their change that is too much or too
+/// little there, and in which file, where that is more than an equation's being idealised and chance make it.
+pub(super) fn not_there(
+    bench: &Workbench<'_>,
+    selection: &Selection,
+    others: &[Unfitted<'_>],
+) -> Option<(f64, String)> {
+    let members = &selection.fit.model.members;
+    let rough = members
+        .iter()
+        .map(|member| roughness(bench, member))
+        .fold(0.0, f64::max);
+    others
+        .iter()
+        .filter_map(|other| {
+            let (times, error) = other.times_there(&selection.fit.model)?;
+            let off = (1.0 - times).abs();
+            (off - select::CERTAIN * error > WAVERS * rough).then(|| {
+                let text = format!(
+                    "{}, which was never fitted, has {} times the change that is expected there",
+                    other.file.display(),
+                    short(times)
+                );
+                (off.powi(2), text)
+            })
+        })
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+}
+
+/// Whether every file that was never fitted is predicted much better with the effects than without.
+pub(super) fn confirmed(selection: &Selection, others: &[Unfitted<'_>]) -> bool {
+    let better =
+        |other: &Unfitted<'_>| other.rmse(&selection.fit.model) <= CONFIRMED * other.rmse_before();
+    !others.is_empty() && others.iter().all(better)
+}
+
+/// Takes effects out again that make the prediction of files that were never fitted worse.
+pub(super) fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>]) {
+    if others.is_empty() {
+        return;
+    }
+    let worst = |with: &Model, without: &Model| -> f64 {
+        others
+            .iter()
+            .map(|other| other.rmse(with) / other.rmse(without).max(1e-300))
+            .fold(0.0, f64::max)
+    };
+    while !selection.named.is_empty() {
+        let found = (0..selection.fit.model.members.len())
+            .map(|index| {
+                let without = fit::fit(bench, &selection.fit.model.without(index), None);
+                let ratio = worst(&selection.fit.model, &without.model);
+                (index, without, ratio)
+            })
+            .max_by(|a, b| a.2.total_cmp(&b.2));
+        let Some((index, without, ratio)) = found.filter(|(_, _, ratio)| *ratio > WORSE) else {
+            return;
+        };
+        selection.refused.push(format!(
+            "{}: fits here, but makes the error in a file that was not fitted {:.2} times as large",
+            selection.fit.model.members[index].id(),
+            ratio
+        ));
+        selection.fit = fit::polish(bench, &without);
+        selection.rename(bench);
+    }
+}

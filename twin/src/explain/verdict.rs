@@ -1,0 +1,441 @@
+//! The verdict on one signal: what a true model would leave, what is left, and what that says of the names.
+
+use super::fit::{self, Fit};
+use super::flexible::{Explainable, Features};
+use super::select::{self, Selection, percent};
+use super::told::short;
+use super::workbench::Workbench;
+use super::{Held, intervals, jumps, rms};
+use crate::problem::Coloured;
+use crate::report::data::Verdict;
+
+/// Structure left beside the named effects makes the explanation a partial one from this share of the residual on.
+const LEFT: f64 = 0.04;
+/// A mismatch that no effect explains is one from this share within reach of the inputs on.
+const STRUCTURE: f64 = 0.1;
+/// What remains is too loud from this multiple of the stated noise on.
+const LOUD: f64 = 1.3;
+/// Where no noise is stated, a mismatch is more than noise with a memory from this multiple of its jumps on.
+const SLOW: f64 = 10.0;
+/// Where no effect passes, loudness is judged by this share of the residual's sizes, which is so many standard deviations of a
+/// normal distribution: a few readings do not make a loud recording. Those have a question of their own, [`STRAY`].
+const COMMON: (f64, f64) = (0.8, 1.2816);
+/// Times the stated noise that noise never is.
+const STRAY: f64 = 8.0;
+/// Fewer readings beyond it are not told from a slip of the log.
+const STRAYS: usize = 2;
+/// Those readings are the mismatch if they make this share of its energy.
+const STRAYED: f64 = 0.5;
+/// So many in a row, all to one side, are the mismatch however little they make of it: something was there for a while.
+const IN_A_ROW: usize = 3;
+/// Where no noise is stated, a heavy tail is a noise of its own: there they have to be nearly all of it.
+const NEARLY_ALL: f64 = 0.9;
+/// From this correlation on, what is left sits where the named effects act: their shape is wrong.
+const ALIKE: f64 = 0.35;
+/// From this ratio of what is left explainable to what the named effects explain on, their names are not to be trusted: another
+/// physics of the same shape would leave as much.
+const DOUBTFUL: f64 = 0.12;
+/// Below this ratio it is traces, wherever they sit: even a true effect's equation is a model.
+const TRACES: f64 = 0.05;
+/// From this share on (5 % rms, as much as an idealised equation may be off) the name is doubted: another physics of much the same
+/// shape could be behind it. The same where so much of what the effects take is left within reach of the inputs, or beyond the
+/// stated noise.
+const DOUBTED: f64 = 0.0025;
+/// What is left has to have this many times the energy of the stated noise to be beyond it: noise is stated to five percent at best.
+const STATED: f64 = 1.1;
+
+/// The verdict on one signal. Where the names are not to be trusted, the effects are taken back.
+pub(super) fn judge(
+    bench: &Workbench<'_>,
+    selection: &mut Selection,
+    features: &Features,
+    confirmed: bool,
+    before: Explainable,
+    left: Explainable,
+    unavoidable: f64,
+) -> Verdict {
+    let count = bench.len().max(1) as f64;
+    let noise = bench.problem.noise;
+    if selection.named.is_empty() {
+        return without_names(bench, selection, before);
+    }
+    let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
+    let rest = energy(&selection.fit);
+    let quiet = noise * noise * count;
+    let explained = energy(&selection.plain) - rest + (unavoidable - quiet);
+    let smooth = if left.is_real() && left.share > LEFT {
+        left.share * rest
+    } else {
+        0.0
+    };
+    // What is beyond the noise that the design states is structure too, whatever the inputs say of it.
+    let louder = |rest: f64, unavoidable: f64, coloured: Coloured| {
+        let allowed = allowed(bench, unavoidable);
+        let limit = LOUD * LOUD * allowed + swing(bench, coloured) * count;
+        if noise > 0.0 && rest > limit {
+            rest - allowed
+        } else {
+            0.0
+        }
+    };
+    let beyond = louder(rest, unavoidable, bench.coloured());
+    // A drift that is slower than the stated noise hides in it once that was made white: not as it was read.
+    let seen = |fit: &Fit| {
+        let as_read = bench.as_read(&fit.residual);
+        fit::dot(&as_read, &as_read)
+    };
+    let rest_read = seen(&selection.fit);
+    // As a share of what the named effects take.
+    let drift = if bench.is_white() {
+        let taken = (seen(&selection.plain) - rest_read).max(1e-300);
+        louder(rest_read, unavoidable, bench.problem.coloured) / taken
+    } else {
+        0.0
+    };
+    if smooth > 0.0 {
+        selection.decisions.push(format!(
+            "Structure is left: a smooth function of the recorded inputs would take {} of what remains (placebos up to {}), {} of what the named effects take.",
+            percent(left.share),
+            percent(left.placebo_most),
+            percent(smooth / explained.max(1e-300))
+        ));
+    }
+    if beyond > 0.0 || drift > 0.0 {
+        let loud = if beyond > 0.0 { rest } else { rest_read };
+        selection.decisions.push(format!(
+            "What remains is {} times the noise that the model file states.",
+            short((loud / unavoidable).sqrt())
+        ));
+    }
+    if smooth > 0.0 || beyond > 0.0 || drift > 0.0 {
+        // What the model file's own equations may be off by is no sign of another physics.
+        let ratio = (smooth.max(beyond) - bench.modelled).max(0.0) / explained.max(1e-300);
+        let ratio = ratio.max(drift);
+        let change = fit::change(&selection.fit.predicted, &selection.plain.predicted);
+        let (shape, change) = features.shape(&selection.fit.residual, &change);
+        let alike = if smooth > 0.0 {
+            correlation(&shape, &change)
+        } else {
+            0.0
+        };
+        if !confirmed && (ratio > DOUBTFUL || (alike > ALIKE && ratio > TRACES)) {
+            let ids = selection.fit.model.ids().join(", ");
+            selection.refused.push(format!(
+                "{ids}: the best of the library, but so much structure is left, and where these effects act, that the true physics is likely another"
+            ));
+            selection.fit = selection.plain.clone();
+            selection.named.clear();
+            return Verdict::Unknown;
+        }
+        return Verdict::PartlyExplained;
+    }
+    if selection
+        .named
+        .iter()
+        .any(|named| !named.equivalent.is_empty())
+    {
+        Verdict::Ambiguous
+    } else {
+        Verdict::Explained
+    }
+}
+
+/// The verdict where nothing is named: whether something is left all the same, and what tells it.
+fn without_names(bench: &Workbench<'_>, selection: &mut Selection, before: Explainable) -> Verdict {
+    let noise = bench.problem.noise;
+    let known = noise.max(bench.problem.accuracy.zero);
+    let residual = &selection.plain.residual;
+    let as_read = bench.as_read(residual);
+    let common = |residual: &[f64]| {
+        let common = quantile(residual, COMMON.0) / COMMON.1;
+        common.min(rms(residual.iter().copied()))
+    };
+    // What the readings jump by from one to the next is the most that noise without a memory can be.
+    let (floor, times, of) = if noise > 0.0 {
+        (known, LOUD, "the noise that the model file states")
+    } else {
+        let jumps = fit::spread(&jumps(residual)) / std::f64::consts::SQRT_2;
+        (
+            known.max(jumps),
+            SLOW,
+            "what it changes from reading to reading",
+        )
+    };
+    let loudest = [
+        (common(residual), swing(bench, bench.coloured())),
+        (common(&as_read), swing(bench, bench.problem.coloured)),
+    ]
+    .into_iter()
+    .filter(|(common, swing)| *common > (times * floor).hypot(swing.sqrt()))
+    .map(|(common, _)| common)
+    .fold(0.0, f64::max);
+    if floor > 0.0 && loudest > 0.0 {
+        selection.decisions.push(format!(
+            "No effect passes, yet all over the recording the mismatch is {} times {of}: unknown.",
+            short(loudest / floor)
+        ));
+        Verdict::Unknown
+    } else if before.is_real() && before.share > STRUCTURE {
+        selection.decisions.push(format!(
+            "No effect passes, yet a smooth function of the recorded inputs takes {} of the held-out error (placebos up to {}): unknown.",
+            percent(before.share),
+            percent(before.placebo_most)
+        ));
+        Verdict::Unknown
+    } else if let Some(strays) = strays(bench, residual).filter(|strays| strays.decide) {
+        selection.decisions.push(format!(
+            "No effect passes, yet {} off by more than {STRAY} times {of}, and not the others, the worst by {} {} at {} s: unknown.",
+            match strays.count {
+                1 => "one reading is".to_owned(),
+                count => format!("{count} readings are"),
+            },
+            short(strays.largest),
+            bench.problem.unit,
+            short(strays.at_s),
+        ));
+        Verdict::Unknown
+    } else {
+        selection.decisions.push(
+            "No effect passes, and no smooth function of the recorded inputs explains more than chance.".into(),
+        );
+        Verdict::NoMismatch
+    }
+}
+
+/// Energy that a true model would leave: the stated noise, as it comes through the end of the chain.
+pub(super) fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
+    let count = bench.len() as f64;
+    let noise = bench.problem.noise;
+    let as_read = bench.as_read(&fit.predicted);
+    let clues = bench.clues(&as_read);
+    let cuts =
+        fit.model.members.iter().any(|member| {
+            member.effect.cuts() && member.effect.noise_ahead(&member.values, &clues)
+        });
+    if noise > 0.0 && cuts {
+        let energy = bench.noise_energy(&fit.model, &fit.predicted, noise, seed);
+        energy.max(noise * noise * count)
+    } else if noise > 0.0 {
+        noise * noise * count
+    } else {
+        // A grid is told by the readings; reading and simulation are both on it.
+        let grid: f64 = fit
+            .model
+            .members
+            .iter()
+            .filter_map(|member| member.effect.mark(&bench.scale, &clues))
+            .map(|mark| mark.variance)
+            .sum();
+        2.0 * grid * count
+    }
+}
+
+/// Readings that no stated noise makes.
+struct Strays {
+    count: usize,
+    /// The largest of them, in the view's unit, and its time in s.
+    largest: f64,
+    at_s: f64,
+    /// Whether they are the mismatch: most of it, or so many in a row that it is no slip of the log.
+    decide: bool,
+}
+
+/// Readings far beyond the stated noise, and what reference and time stamps are accurate to, if there are some.
+fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
+    let stated = bench.problem.noise > 0.0;
+    let (noise, least, share) = if stated {
+        (bench.problem.noise, STRAYS, STRAYED)
+    } else {
+        // Of the changes from reading to reading the common ones: the strays are not to hide behind themselves.
+        let jumps: Vec<f64> = jumps(residual);
+        let common = quantile(&jumps, COMMON.0) / COMMON.1 / std::f64::consts::SQRT_2;
+        (common.max(bench.scale.quantum), 1, NEARLY_ALL)
+    };
+    if noise <= 0.0 {
+        return None;
+    }
+    let rows: Vec<usize> = (0..bench.len())
+        .filter(|&row| residual[row].abs() > STRAY * noise + bench.accuracy(row))
+        .collect();
+    let largest = *rows
+        .iter()
+        .max_by(|a, b| residual[**a].abs().total_cmp(&residual[**b].abs()))?;
+    let energy: f64 = rows.iter().map(|&row| residual[row].powi(2)).sum();
+    let all: f64 = residual.iter().map(|r| r * r).sum();
+    let in_a_row = rows
+        .chunk_by(|a, b| b - a == 1 && residual[*a] * residual[*b] > 0.0)
+        .map(<[usize]>::len)
+        .fold(0, usize::max);
+    Some(Strays {
+        count: rows.len(),
+        largest: residual[largest].abs(),
+        at_s: bench.t_s[largest],
+        decide: (rows.len() >= least && energy > share * all) || (stated && in_a_row >= IN_A_ROW),
+    })
+}
+
+/// What is to be said of readings that no noise makes and that nothing accounts for, where they decide nothing.
+pub(super) fn slips(read: &Workbench<'_>, shown: &Fit) -> Option<String> {
+    let strays = strays(read, &shown.residual).filter(|_| read.problem.noise > 0.0)?;
+    let of_what = if shown.model.members.is_empty() {
+        ""
+    } else {
+        " after all that is named"
+    };
+    Some(format!(
+        "{}: {} off by more than {STRAY} times the stated noise{of_what}, the worst by {} {} at {} s: a slip of the log, or something too rare here to name",
+        read.problem.name,
+        match strays.count {
+            1 => "one reading is".to_owned(),
+            count => format!("{count} readings are"),
+        },
+        short(strays.largest),
+        read.problem.unit,
+        short(strays.at_s),
+    ))
+}
+
+/// The least energy that the design lets be left: what is unavoidable, or the reference's own zero.
+pub(super) fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
+    let zero = bench.problem.accuracy.zero;
+    unavoidable.max(zero * zero * bench.len() as f64)
+}
+
+/// By how much the mean square of the stated noise that has a memory, in the view's unit squared, can be above the stated one by
+/// chance: over T it has no more than T/τ independent values (its squares' covariance falls as the square of its own).
+pub(super) fn swing(bench: &Workbench<'_>, coloured: Coloured) -> f64 {
+    let span_s = match bench.t_s.as_slice() {
+        [first, .., last] if last > first => last - first,
+        _ => return 0.0,
+    };
+    select::CERTAIN * coloured.rms.powi(2) * (2.0 * coloured.tau_s / span_s).sqrt()
+}
+
+/// The verdict once more: names whose values waver, or that leave what follows the inputs, are the best of the library and no
+/// more; and where all names were taken back for that, the mismatch is still there. If names are doubted, with the energy that may
+/// be another physics' ([`intervals::intervals`]).
+pub(super) fn doubt(
+    bench: &Workbench<'_>,
+    selection: &mut Selection,
+    verdict: Verdict,
+    (left, held): (Explainable, &Held),
+    (confirmed, taken_back): (bool, bool),
+    not_there: Option<(f64, String)>,
+    unavoidable: f64,
+) -> (Verdict, Option<f64>) {
+    if taken_back && verdict == Verdict::NoMismatch {
+        selection.decisions.push(
+            "There is a mismatch, yet the only effects that take it are not named: unknown.".into(),
+        );
+        return (Verdict::Unknown, None);
+    }
+    if confirmed || selection.named.is_empty() {
+        return (verdict, None);
+    }
+    let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
+    let rest = energy(&selection.fit);
+    let explained = (energy(&selection.plain) - rest).max(1e-300);
+    let wavers = intervals::variations(bench, &selection.fit)
+        .into_iter()
+        .filter(|variation| variation.deviations > select::CERTAIN)
+        .fold(0.0f64, |most, variation| most.max(variation.share));
+    let (missed, carried) = carried(&selection.fit, held);
+    // Each as a share of what the named effects change, in energy; and whether it is more than chance.
+    let signs = [
+        (
+            missed / explained,
+            carried,
+            "its values from one part of the recording miss the other by",
+        ),
+        (
+            wavers,
+            true,
+            "its values would have to differ from stretch to stretch by",
+        ),
+        (
+            left.share * rest / explained,
+            left.is_real(),
+            "what is left within reach of the inputs is",
+        ),
+        (
+            beyond(bench, rest, unavoidable) / explained,
+            true,
+            "what is left beyond the stated noise is",
+        ),
+    ];
+    let members = &selection.fit.model.members;
+    let general = members.iter().find(|member| member.effect.general());
+    let mut doubts: Vec<String> = general
+        .map(|member| format!("{} follows any process of its kind", member.id()))
+        .into_iter()
+        .collect();
+    for (share, real, what) in signs {
+        if real && share > DOUBTED {
+            doubts.push(format!("{what} {} of its change", percent(share.sqrt())));
+        }
+    }
+    let elsewhere = not_there.as_ref().map_or(0.0, |(share, _)| *share);
+    doubts.extend(not_there.map(|(_, text)| text));
+    if doubts.is_empty() {
+        return (verdict, None);
+    }
+    selection.decisions.push(format!(
+        "{}: the best of the library, yet {}: another physics of much the same shape may be behind it.",
+        selection.fit.model.ids().join(", "),
+        doubts.join(", and ")
+    ));
+    let most = signs
+        .iter()
+        .map(|(share, ..)| *share)
+        .fold(elsewhere, f64::max);
+    (Verdict::Ambiguous, Some(most * explained))
+}
+
+/// Energy by which values that were found in a part of the recording miss the other part, beyond what the fit leaves; and whether
+/// that is much beside it.
+pub(super) fn carried(fit: &Fit, held: &Held) -> (f64, bool) {
+    let told = held.residual.iter().zip(&fit.residual);
+    let (there, here) = told
+        .filter(|(there, _)| there.is_finite())
+        .fold((0.0, 0.0), |(a, b), (there, here)| {
+            (a + there * there, b + here * here)
+        });
+    ((there - here).max(0.0), there > STATED * here)
+}
+
+/// Energy of what is left beyond the stated noise, if that is stated well enough to tell.
+pub(super) fn beyond(bench: &Workbench<'_>, rest: f64, unavoidable: f64) -> f64 {
+    let allowed = allowed(bench, unavoidable);
+    let count = bench.len().max(1) as f64;
+    let chance = select::CERTAIN * allowed * (2.0 / count).sqrt();
+    let certain = rest > STATED * allowed
+        && rest - allowed > chance.max(swing(bench, bench.coloured()) * count);
+    if bench.problem.noise > 0.0 && certain {
+        rest - allowed
+    } else {
+        0.0
+    }
+}
+
+/// Correlation of the sizes of two series.
+pub(super) fn correlation(a: &[f64], b: &[f64]) -> f64 {
+    let count = a.len().max(1) as f64;
+    let mean = |series: &[f64]| series.iter().map(|v| v.abs()).sum::<f64>() / count;
+    let (ma, mb) = (mean(a), mean(b));
+    let (mut ab, mut aa, mut bb) = (0.0, 0.0, 0.0);
+    for (x, y) in a.iter().zip(b) {
+        let (x, y) = (x.abs() - ma, y.abs() - mb);
+        ab += x * y;
+        aa += x * x;
+        bb += y * y;
+    }
+    ab / (aa * bb).sqrt().max(1e-300)
+}
+
+/// The size that a share of a series stays below.
+fn quantile(series: &[f64], share: f64) -> f64 {
+    let mut sizes: Vec<f64> = series.iter().map(|value| value.abs()).collect();
+    sizes.sort_unstable_by(f64::total_cmp);
+    let at = (sizes.len() as f64 * share) as usize;
+    sizes.get(at).copied().unwrap_or_default()
+}
