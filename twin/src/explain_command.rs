@@ -357,6 +357,7 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
             });
         }
         shift.take(fitted.nuisance);
+        shift.smooth_reference |= fitted.smooth_reference;
     }
     model.extended(&found, shift, file.parent().unwrap_or(Path::new("")), out)
 }

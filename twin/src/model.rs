@@ -84,6 +84,8 @@ pub struct Sensor {
     pub accuracy: AccuracySpec,
     /// The reference stays at its value until its next row.
     pub held_reference: bool,
+    /// The reference goes from row to row in a smooth course.
+    pub smooth_reference: bool,
     /// Time means nothing: the order of the rows counts, not when they were measured.
     pub quasi_static: bool,
     /// Of a board: time from the end of a conversion to the earliest row that can tell of it, in s.
@@ -378,6 +380,10 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
             return Err(places.fault(&["sensor", "accuracy", key], &value.to_string(), expected));
         }
     }
+    if sensor.smooth_reference && sensor.held_reference {
+        let expected = "one of smooth_reference and held_reference";
+        return Err(places.fault(&["sensor", "smooth_reference"], "both", expected));
+    }
     let limits = core_logic::sliding_average::LENGTH_LIMITS;
     if let Some(average) = sensor.average
         && !(limits.0..=limits.1).contains(&average)
@@ -411,6 +417,11 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
         ("interval_s", sensor.interval_s > 0.0, "its conversion"),
         ("full_scale", sensor.full_scale.is_some(), "its front end"),
         ("range_limit", sensor.range_limit.is_some(), "its front end"),
+        (
+            "smooth_reference",
+            sensor.smooth_reference,
+            "conversions of straight lines",
+        ),
     ] {
         if stated {
             return Err(places.fault(

@@ -356,6 +356,11 @@ impl<'a> Work<'a> {
                 &counter,
             )?);
         }
+        if sensor.smooth_reference {
+            for item in &mut items {
+                item.problem = item.problem.with_smooth_reference();
+            }
+        }
         Ok(items)
     }
 

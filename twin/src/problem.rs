@@ -3,6 +3,8 @@
 //! Recording and model file become one [`Problem`] for each signal that can be compared. Everything after that
 //! (location, effects, selection) knows nothing of files.
 
+mod smooth;
+
 use std::ops::{Deref, DerefMut, Range};
 use std::sync::Arc;
 
@@ -90,6 +92,8 @@ pub struct Drive {
     /// True where the segment of the same index continues the one before: a gap, and no new operation. What a cell or a core
     /// remembers goes on over it ([`Drive::operations`]).
     pub continues: Vec<bool>,
+    /// Rows that stand for one recorded step ([`Problem::smoothed`]); 0 and 1: the rows are those that were recorded.
+    pub parts: usize,
 }
 
 /// The drive's segment that each row of an observation belongs to: rows of one segment follow one another, and only where another
@@ -204,6 +208,8 @@ pub struct SensorBase {
     pub range_limit: Option<f64>,
     /// True if the reference stays at its value until its next row instead of going there in a straight line.
     pub held_reference: bool,
+    /// True if the reference goes from row to row in a smooth course instead of a straight line ([`Problem::smoothed`]).
+    pub smooth_reference: bool,
     /// True if the recording's time means nothing (a loop measured point by point): no effect goes by the clock.
     pub quasi_static: bool,
 }
@@ -322,7 +328,12 @@ impl Drive {
         segment > 0 && self.continues.get(segment).copied().unwrap_or_default()
     }
 
-    /// Median step in s over all segments; 0 with fewer than two rows.
+    /// Rows that stand for one recorded step, 1 or more.
+    pub fn stride(&self) -> usize {
+        self.parts.max(1)
+    }
+
+    /// Median recorded step in s over all segments; 0 with fewer than two rows.
     pub fn median_step_s(&self) -> f64 {
         let mut steps: Vec<f64> = self
             .segments
@@ -330,7 +341,7 @@ impl Drive {
             .flat_map(|rows| {
                 self.t_s[rows.clone()]
                     .windows(2)
-                    .map(|pair| pair[1] - pair[0])
+                    .map(|pair| (pair[1] - pair[0]) * self.stride() as f64)
             })
             .filter(|step| *step > 0.0)
             .collect();

@@ -120,14 +120,16 @@ fn range_changes(drive: &Drive, sensor: Option<&SensorBase>) -> Vec<RangeChange>
     };
     let size = |row: usize| drive.reference[row].abs();
     let high = |row: usize| flag[row] > 0.5;
+    // From one recorded row to the next.
+    let stride = drive.stride();
     let steps = || {
         let segments = drive.segments.iter().filter(|rows| !rows.is_empty());
-        segments.flat_map(|rows| rows.start + 1..rows.end)
+        segments.flat_map(|rows| (rows.start + stride..rows.end).step_by(stride))
     };
     // Of each way: sizes that the limit is above, and sizes that it is below.
     let (mut up, mut down) = ((Vec::new(), Vec::new()), (Vec::new(), Vec::new()));
     for row in steps() {
-        match (high(row - 1), high(row)) {
+        match (high(row - stride), high(row)) {
             (false, false) => up.0.push(size(row)),
             (false, true) => up.1.push(size(row)),
             (true, true) => down.1.push(size(row)),
@@ -141,8 +143,8 @@ fn range_changes(drive: &Drive, sensor: Option<&SensorBase>) -> Vec<RangeChange>
     let down = limit(down.0, down.1, None);
     let mut changes = Vec::new();
     for row in steps() {
-        let h = (drive.t_s[row] - drive.t_s[row - 1]).max(0.0);
-        let (from, to) = (drive.reference[row - 1], drive.reference[row]);
+        let h = (drive.t_s[row] - drive.t_s[row - stride]).max(0.0);
+        let (from, to) = (drive.reference[row - stride], drive.reference[row]);
         // A held reference jumps: when within the step, nobody knows.
         let since_s = |limit: f64| {
             if sensor.held_reference || from == to {
@@ -161,7 +163,7 @@ fn range_changes(drive: &Drive, sensor: Option<&SensorBase>) -> Vec<RangeChange>
             since_s: since_s(down.copysign(from)),
             high: false,
         };
-        match (high(row - 1), high(row)) {
+        match (high(row - stride), high(row)) {
             (false, true) => changes.push(rises),
             (true, false) => changes.push(falls),
             (true, true) if from * to < 0.0 && !sensor.held_reference => {
@@ -169,6 +171,15 @@ fn range_changes(drive: &Drive, sensor: Option<&SensorBase>) -> Vec<RangeChange>
             }
             _ => (),
         }
+    }
+    // To the first of the rows between that comes after it.
+    for change in changes.iter_mut().filter(|_| stride > 1) {
+        let at_s = drive.t_s[change.row] - change.since_s;
+        let recorded = change.row;
+        while change.row > recorded + 1 - stride && drive.t_s[change.row - 1] > at_s {
+            change.row -= 1;
+        }
+        change.since_s = drive.t_s[change.row] - at_s;
     }
     changes
 }

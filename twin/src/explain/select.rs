@@ -916,7 +916,7 @@ fn rivals(
     let mut count: Vec<(&'static str, usize)> = Vec::new();
     for (rank, entry) in screening.entries.iter().enumerate() {
         let other = entry.member.effect;
-        if entry.gain <= RIVALS * taken || other.card().id == id || model.has(other.card().id) {
+        if entry.gain <= RIVALS * taken || other.card().id == id || !joins(model, other) {
             continue;
         }
         let known = count
@@ -938,7 +938,7 @@ fn rivals(
     let as_read = bench.as_read(&without.predicted);
     let clues = bench.clues(&as_read);
     for effect in bench.library.iter().copied().filter(alike) {
-        if model.has(effect.card().id) {
+        if !joins(model, effect) {
             continue;
         }
         let mut starts: Vec<(f64, Member)> = effect
@@ -946,7 +946,7 @@ fn rivals(
             .into_par_iter()
             .map(|values| {
                 let member = Member { effect, values };
-                let there = bench.run(&without.model.with(member.clone()));
+                let there = bench.run(&added(&without.model, member.clone()));
                 (loss(&bench.residual(&there), without.sigma), member)
             })
             .collect();
@@ -966,6 +966,14 @@ fn rivals(
     members
 }
 
+/// Whether an effect can stand beside those of a model: it is not there, or it has more branches than what is there and takes that
+/// one's place as well.
+fn joins(model: &Model, effect: &'static dyn Effect) -> bool {
+    let card = effect.card();
+    let same = model.members.iter().find(|member| member.id() == card.id);
+    same.is_none_or(|member| card.parameters.len() > member.values.len())
+}
+
 /// Fits every rival in the place of every effect.
 fn swapped(bench: &Workbench<'_>, now: &Fit) -> Vec<(usize, Fit)> {
     let (places, models): (Vec<usize>, Vec<Model>) = (0..now.model.members.len())
@@ -975,7 +983,7 @@ fn swapped(bench: &Workbench<'_>, now: &Fit) -> Vec<(usize, Fit)> {
             let taken = share(bench, &without, now);
             rivals(bench, &without, &now.model, (id, taken))
                 .into_iter()
-                .map(|rival| without.model.with(rival))
+                .map(|rival| added(&without.model, rival))
                 // An alignment that is free can take over what a rival explains, and leave it nothing to be named for.
                 .flat_map(|model| {
                     let unaligned = bench.aligns(&model).then(|| Model {

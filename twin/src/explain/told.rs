@@ -6,7 +6,7 @@ use super::select::{Selection, percent};
 use super::workbench::{Member, Workbench};
 use super::{Nuisance, intervals, locate};
 use crate::effects::find;
-use crate::problem::Problem;
+use crate::problem::{Base, Problem};
 use crate::report::data::{
     EffectReport, FittedModel, Location, LocationKind, ParameterReport, Report, SignalPlots,
     Verdict,
@@ -15,6 +15,10 @@ use crate::spectrum;
 
 /// What a battery is found to be off by is told from here on, in %.
 const TOLD_PERCENT: f64 = 0.1;
+/// An alignment of readings is told from this share of a step on.
+const TOLD_STEP: f64 = 0.05;
+/// What the model file leaves open is in the verdict's sentence if it makes the error smaller by this factor.
+const NOT_AS_STATED: f64 = 1.5;
 /// Share of what is in a band of frequency from which on an effect reaches it.
 const REACHES: f64 = 0.1;
 
@@ -199,6 +203,16 @@ pub(super) fn sentence(
         )
     });
     match verdict {
+        Verdict::NoMismatch
+            if let Some(found) = base_differs(selection.fit.model.nuisance)
+                && report.signals.last().is_some_and(|signal| {
+                    signal.rmse_before > NOT_AS_STATED * signal.rmse_after
+                }) =>
+        {
+            format!(
+                "{name}: no physics is left out, but {found} than stated, within what the model file leaves open ({figures})."
+            )
+        }
         Verdict::NoMismatch => format!(
             "{name}: recording and simulation agree; nothing is left that any effect explains better than chance."
         ),
@@ -232,6 +246,13 @@ pub(super) fn sentence(
 /// What was found of a battery within what the model file leaves open: it is no physics that was left out, and part of every error
 /// after it.
 pub(super) fn base_found(name: &str, nuisance: Nuisance) -> Option<String> {
+    base_differs(nuisance).map(|found| {
+        format!("{name}: within what the model file leaves open, {found} than stated fits; the errors after are with that")
+    })
+}
+
+/// By what the battery as designed differs, if by more than [`TOLD_PERCENT`].
+fn base_differs(nuisance: Nuisance) -> Option<String> {
     let by = |share: f64, what: &str, unit: &str| {
         let percent = 100.0 * share;
         let way = if percent > 0.0 { "higher" } else { "lower" };
@@ -246,12 +267,33 @@ pub(super) fn base_found(name: &str, nuisance: Nuisance) -> Option<String> {
     .into_iter()
     .flatten()
     .collect();
-    (!found.is_empty()).then(|| {
+    (!found.is_empty()).then(|| found.join(" and "))
+}
+
+/// What the times of the readings, and the reference between its rows, were found to be beside the effects.
+pub(super) fn times_found(
+    bench: &Workbench<'_>,
+    fit: &Fit,
+    course: Option<[f64; 2]>,
+) -> Vec<String> {
+    let (name, unit) = (&bench.problem.name, &bench.problem.unit);
+    let later_s = fit.model.nuisance.alignment_s;
+    let aligned = (later_s.abs() > TOLD_STEP * bench.scale.reading_step_s).then(|| {
         format!(
-            "{name}: within what the model file leaves open, {} than stated fits; the errors after are with that",
-            found.join(" and ")
+            "{name}: readings stand for a moment {} s {} than their rows, less than a row apart and so no effect by itself; \
+             a delay of that size beside what is named would look the same",
+            short(later_s.abs()),
+            if later_s > 0.0 { "earlier" } else { "later" }
         )
-    })
+    });
+    let smooth = course.map(|[straight, smooth]| {
+        format!(
+            "{name}: between its rows the reference is taken to go smoothly (error {} {unit}, with straight lines {} {unit})",
+            short(smooth),
+            short(straight)
+        )
+    });
+    aligned.into_iter().chain(smooth).collect()
 }
 
 pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
@@ -273,6 +315,7 @@ pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
             .map(|member| (member.id().to_owned(), values(member)))
             .collect(),
         nuisance: fit.model.nuisance,
+        smooth_reference: matches!(&problem.base, Base::Sensor(base) if base.smooth_reference),
     }
 }
 

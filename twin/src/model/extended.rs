@@ -30,6 +30,8 @@ pub struct Shift {
     pub resistance: f64,
     /// Time by which readings stand for an earlier moment than their row, in s.
     pub alignment_s: f64,
+    /// The reference goes from row to row in a smooth course.
+    pub smooth_reference: bool,
 }
 
 impl Shift {
@@ -71,6 +73,11 @@ impl Extension<'_> {
             && let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut)
         {
             set(sensor, "alignment_s", value(self.shift.alignment_s));
+        }
+        if self.shift.smooth_reference
+            && let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut)
+        {
+            set(sensor, "smooth_reference", value(true));
         }
         if !self.effects.is_empty() {
             self.effects(&mut document)?;
