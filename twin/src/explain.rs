@@ -229,6 +229,7 @@ fn one(
         left,
         held,
         beside,
+        vetoed,
         ..
     } = decided;
     let doubted = beside.is_some();
@@ -291,7 +292,19 @@ fn one(
         report.remarks.extend(slips(&read, &shown));
     }
     report.plots.push(plots(&read, &shown, &held.read));
-    let sentence = sentence(bench, &selection, (verdict, doubted), left, report);
+    let mut sentence = sentence(
+        bench,
+        &selection,
+        (verdict, doubted),
+        left,
+        (&vetoed, report),
+    );
+    if verdict != Verdict::Unknown {
+        let left = others
+            .iter()
+            .filter_map(|other| other.left(&selection.fit.model));
+        left.for_each(|left| sentence.extend([" ", &left]));
+    }
     Part {
         verdict,
         sentence,
@@ -309,6 +322,8 @@ struct Decided {
     beside: Option<f64>,
     /// Whether it was decided on what each reading says beyond those before it.
     on_white: bool,
+    /// What was taken back for a file that was never fitted.
+    vetoed: Vec<&'static str>,
 }
 
 impl Decided {
@@ -357,7 +372,7 @@ fn decide(
     let features = Features::new(bench);
     let before = features.explain(&selection.plain.residual, seed);
     let passed = !selection.named.is_empty();
-    veto(bench, &mut selection, others);
+    let vetoed = veto(bench, &mut selection, others);
     vague(bench, &mut selection);
     if wavering(bench, &mut selection, others) {
         vague(bench, &mut selection);
@@ -383,7 +398,7 @@ fn decide(
         &mut selection,
         verdict,
         (left, &held),
-        (confirmed, taken_back),
+        (confirmed && not_there.is_none(), taken_back),
         not_there,
         unavoidable,
     );
@@ -394,6 +409,7 @@ fn decide(
         held,
         beside,
         on_white: bench.is_white(),
+        vetoed,
     }
 }
 

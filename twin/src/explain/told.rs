@@ -179,7 +179,7 @@ pub(super) fn sentence(
     selection: &Selection,
     (verdict, doubted): (Verdict, bool),
     left: Explainable,
-    report: &Report,
+    (vetoed, report): (&[&str], &Report),
 ) -> String {
     let name = &bench.problem.name;
     let ids: Vec<String> = selection
@@ -236,6 +236,10 @@ pub(super) fn sentence(
         Verdict::Ambiguous => format!(
             "{name}: explained by {} ({figures}); this recording cannot tell them apart.",
             ids.join(" and ")
+        ),
+        Verdict::Unknown if !vetoed.is_empty() => format!(
+            "{name}: there is a mismatch; here {} would account for it, but a file that was never fitted gets worse with it ({figures}).",
+            vetoed.join(" and ")
         ),
         Verdict::Unknown => format!(
             "{name}: there is a mismatch, and no effect of the library accounts for it ({figures})."

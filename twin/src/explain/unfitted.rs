@@ -15,6 +15,8 @@ const WORSE: f64 = 1.05;
 const CONFIRMED: f64 = 0.6;
 /// Places in a turn that are tried for a file that was never fitted.
 const PHASES: f64 = 24.0;
+/// What is left in a file that was never fitted is told from this multiple of the stated noise on.
+const TOLD_NOISE: f64 = 3.0;
 
 /// A file that was never fitted, ready to be predicted.
 pub(super) struct Unfitted<'a> {
@@ -45,6 +47,21 @@ impl<'a> Unfitted<'a> {
             rmse_before: self.rmse_before(),
             rmse_after: self.rmse(model),
         }
+    }
+
+    /// What is left there, where that is far more than the stated noise.
+    pub(super) fn left(&self, model: &Model) -> Option<String> {
+        let problem = self.bench.problem;
+        let left = self.rmse(model);
+        (problem.noise > 0.0 && left > TOLD_NOISE * problem.noise).then(|| {
+            format!(
+                "In {}, which was never fitted, {} {} are left, {} times the stated noise.",
+                self.file.display(),
+                short(left),
+                problem.unit,
+                short(left / problem.noise)
+            )
+        })
     }
 
     /// Error with a model.
@@ -168,10 +185,15 @@ pub(super) fn confirmed(selection: &Selection, others: &[Unfitted<'_>]) -> bool 
     !others.is_empty() && others.iter().all(better)
 }
 
-/// Takes effects out again that make the prediction of files that were never fitted worse.
-pub(super) fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[Unfitted<'_>]) {
+/// Takes effects out again that make the prediction of files that were never fitted worse; which.
+pub(super) fn veto(
+    bench: &Workbench<'_>,
+    selection: &mut Selection,
+    others: &[Unfitted<'_>],
+) -> Vec<&'static str> {
+    let mut vetoed = Vec::new();
     if others.is_empty() {
-        return;
+        return vetoed;
     }
     let worst = |with: &Model, without: &Model| -> f64 {
         others
@@ -188,8 +210,9 @@ pub(super) fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[U
             })
             .max_by(|a, b| a.2.total_cmp(&b.2));
         let Some((index, without, ratio)) = found.filter(|(_, _, ratio)| *ratio > WORSE) else {
-            return;
+            break;
         };
+        vetoed.push(selection.fit.model.members[index].id());
         selection.refused.push(format!(
             "{}: fits here, but makes the error in a file that was not fitted {:.2} times as large",
             selection.fit.model.members[index].id(),
@@ -198,4 +221,5 @@ pub(super) fn veto(bench: &Workbench<'_>, selection: &mut Selection, others: &[U
         selection.fit = fit::polish(bench, &without);
         selection.rename(bench);
     }
+    vetoed
 }

@@ -144,6 +144,12 @@ pub(super) fn judge(
 fn without_names(bench: &Workbench<'_>, selection: &mut Selection, before: Explainable) -> Verdict {
     let noise = bench.problem.noise;
     let known = noise.max(bench.problem.accuracy.zero);
+    // What the reference is not accurate to is no mismatch.
+    let inaccurate: Vec<f64> = (0..bench.len()).map(|row| bench.accuracy(row)).collect();
+    let beyond = |residual: &[f64]| -> Vec<f64> {
+        let pairs = residual.iter().zip(&inaccurate);
+        pairs.map(|(r, by)| (r.abs() - by).max(0.0)).collect()
+    };
     let residual = &selection.plain.residual;
     let as_read = bench.as_read(residual);
     let common = |residual: &[f64]| {
@@ -162,8 +168,11 @@ fn without_names(bench: &Workbench<'_>, selection: &mut Selection, before: Expla
         )
     };
     let loudest = [
-        (common(residual), swing(bench, bench.coloured())),
-        (common(&as_read), swing(bench, bench.problem.coloured)),
+        (common(&beyond(residual)), swing(bench, bench.coloured())),
+        (
+            common(&beyond(&as_read)),
+            swing(bench, bench.problem.coloured),
+        ),
     ]
     .into_iter()
     .filter(|(common, swing)| *common > (times * floor).hypot(swing.sqrt()))
@@ -175,7 +184,10 @@ fn without_names(bench: &Workbench<'_>, selection: &mut Selection, before: Expla
             short(loudest / floor)
         ));
         Verdict::Unknown
-    } else if before.is_real() && before.share > STRUCTURE {
+    } else if before.is_real()
+        && before.share > STRUCTURE
+        && before.share * fit::dot(residual, residual) > fit::dot(&inaccurate, &inaccurate)
+    {
         selection.decisions.push(format!(
             "No effect passes, yet a smooth function of the recorded inputs takes {} of the held-out error (placebos up to {}): unknown.",
             percent(before.share),

@@ -156,7 +156,7 @@ mod tests {
 
     fn problem(t_s: Vec<f64>, reference: Vec<f64>) -> Problem {
         let drive = Drive {
-            segments: vec![0..t_s.len()],
+            segments: std::iter::once(0..t_s.len()).collect(),
             continues: vec![false],
             reference: reference.clone().into(),
             t_s: t_s.clone().into(),
