@@ -287,6 +287,11 @@ pub trait Effect: Sync {
         false
     }
 
+    /// Whether it rounds readings to a grid: in the mean they follow what is ahead of it, though hardly one does at a time.
+    fn rounds(&self) -> bool {
+        false
+    }
+
     /// Whether it cuts or rounds what comes in, noise with it: what comes out is no longer a signal with the stated noise on it.
     fn cuts(&self) -> bool {
         false

@@ -373,6 +373,7 @@ fn decide(
     let before = features.explain(&selection.plain.residual, seed);
     let passed = !selection.named.is_empty();
     let vetoed = veto(bench, &mut selection, others);
+    selection.fit = fit::in_the_mean(bench, selection.fit);
     vague(bench, &mut selection);
     if wavering(bench, &mut selection, others) {
         vague(bench, &mut selection);

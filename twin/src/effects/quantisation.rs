@@ -50,6 +50,10 @@ impl Effect for Quantisation {
         true
     }
 
+    fn rounds(&self) -> bool {
+        true
+    }
+
     /// Behind a staircase noise takes readings off its levels.
     fn noise_ahead(&self, values: &[f64], clues: &Clues<'_>) -> bool {
         let known = || clues.observed.iter().copied().filter(|y| y.is_finite());

@@ -20,6 +20,8 @@ const STEPS: usize = 14;
 const SLOW: f64 = 5e-3;
 /// A step with a new slope that lowers the loss by a smaller share is the last.
 const ENOUGH: f64 = 1e-4;
+/// Squares may be larger by this factor where a staircase is right in the mean.
+const WORSE_BY: f64 = 1.05;
 /// Shares of a time at which another minimum is looked for in the end.
 const ELSEWHERE: [f64; 4] = [0.8, 0.9, 1.1, 1.25];
 /// How far away values without a slope are tried.
@@ -372,8 +374,62 @@ fn step_of(bench: &Workbench<'_>, unit: &str, value: f64, low: f64, high: f64) -
     }
 }
 
+/// Whether a model rounds readings to a grid.
+pub fn rounds(model: &Model) -> bool {
+    model.members.iter().any(|member| member.effect.rounds())
+}
+
+/// Values by which the simulation is right in the mean, where it rounds and noise ahead of the grid takes readings a step up or down:
+/// least squares of the staircase itself lean to the side on which fewer do.
+pub fn in_the_mean(bench: &Workbench<'_>, from: Fit) -> Fit {
+    let mut best = from;
+    if !rounds(&best.model) {
+        return best;
+    }
+    let most = WORSE_BY * dot(&best.residual, &best.residual);
+    for _ in 0..STEPS {
+        let slope = best.slope(bench);
+        let even = vec![1.0; best.residual.len()];
+        let (normal, right) = normal(&slope.columns, &even, &best.residual, 0..even.len());
+        let by = solve(&normal, &right, 1e-9);
+        let model = slope.moved(bench, &best.model, by.as_slice());
+        let there = Fit::of(bench, model, best.cost);
+        if dot(&there.residual, &there.residual) > most {
+            break;
+        }
+        let moved = change(&there.predicted, &best.predicted);
+        best = there;
+        if moved.iter().all(|by| *by == 0.0) {
+            break;
+        }
+    }
+    best
+}
+
+/// The model with nothing rounded, and what it says, if it rounds: a small step of a value ahead of a grid moves hardly any
+/// reading, and those by a whole step of the grid.
+fn unrounded(bench: &Workbench<'_>, model: &Model) -> Option<(Model, Vec<f64>)> {
+    rounds(model).then(|| {
+        let mut even = model.clone();
+        let grids = even.members.iter_mut();
+        for member in grids.filter(|member| member.effect.rounds()) {
+            let off = member.effect.card().parameters.iter();
+            member.values = off.map(|parameter| parameter.off).collect();
+        }
+        let predicted = bench.run(&even);
+        (even, predicted)
+    })
+}
+
 /// The slope at a model.
 fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
+    let residual = bench.residual(predicted);
+    let unrounded = unrounded(bench, model);
+    let (model, predicted) = unrounded
+        .as_ref()
+        .map_or((model, predicted), |(model, predicted)| {
+            (model, predicted.as_slice())
+        });
     let mut slope = Slope {
         coordinates: Vec::new(),
         columns: Vec::new(),
@@ -410,7 +466,6 @@ fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
             columns[k] = any.then_some(column);
         }
     }
-    let residual = bench.residual(predicted);
     for ((coordinate, _, prior, at), column) in coordinates.into_iter().zip(columns) {
         if let Some(column) = column
             && !ended(&column, prior, at, &residual)

@@ -18,7 +18,9 @@ use std::ops::Range;
 
 use nalgebra::{DMatrix, DVector};
 
-use super::fit::{Fit, Slope, change, dot, fit as refit, huber, loss, normal, solve, weights};
+use super::fit::{
+    Fit, Slope, change, dot, fit as refit, huber, loss, normal, rounds, solve, weights,
+};
 use super::workbench::{Model, Workbench};
 use crate::effects::{Parameter, Search};
 
@@ -113,7 +115,12 @@ fn inverse(matrix: &DMatrix<f64>) -> DMatrix<f64> {
 /// How sure each coordinate of a slope is; `beside` as in [`intervals`].
 fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope, beside: f64) -> Certainty {
     let size = slope.len();
-    let weights = weights(&fit.residual, fit.sigma);
+    // A reading that noise takes over the edge of a grid is off by a whole step, and no outlier.
+    let weights = if rounds(&fit.model) {
+        vec![1.0 / (fit.sigma * fit.sigma); fit.residual.len()]
+    } else {
+        weights(&fit.residual, fit.sigma)
+    };
     let parts = parts(bench, fit, slope, &weights);
     let (whole, right) = sum(slope, &parts);
     let stated = slope.prior().0;

@@ -288,7 +288,14 @@ fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
 
 /// What is to be said of readings that no noise makes and that nothing accounts for, where they decide nothing.
 pub(super) fn slips(read: &Workbench<'_>, shown: &Fit) -> Option<String> {
-    let strays = strays(read, &shown.residual).filter(|_| read.problem.noise > 0.0)?;
+    // Behind what cuts or rounds, noise is not what the model file states.
+    let cut = shown
+        .model
+        .members
+        .iter()
+        .any(|member| member.effect.cuts());
+    let stated = read.problem.noise > 0.0 && !cut;
+    let strays = strays(read, &shown.residual).filter(|_| stated)?;
     let of_what = if shown.model.members.is_empty() {
         ""
     } else {
