@@ -1,0 +1,137 @@
+//! What a reference does between its rows: loads that bend between them, made on a grid ten times finer than the rows by loops
+//! of this file. Straight lines between the rows make windows too short and a delay look like a window.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+mod common;
+
+use common::{noise, said};
+use twin::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
+use twin::report::data::{ParameterReport, Report};
+
+const ROWS: usize = 3000;
+const STEP_S: f64 = 0.1;
+const FINE: usize = 10;
+const FINE_S: f64 = STEP_S / FINE as f64;
+const NOISE_A: f64 = 0.2;
+
+/// Waves of several lengths, in A, on the finer grid.
+fn load() -> Vec<f64> {
+    (0..ROWS * FINE)
+        .map(|k| k as f64 * FINE_S)
+        .map(|t| {
+            50.0 * (t / 3.0).sin()
+                + 40.0 * (1.3 * t).sin()
+                + 20.0 * (2.9 * t + 0.02 * t * (0.05 * t).sin()).sin()
+        })
+        .collect()
+}
+
+/// First-order low-pass of what goes in straight lines on the finer grid.
+fn low_pass(input: &[f64], tau_s: f64) -> Vec<f64> {
+    let kept = (-FINE_S / tau_s).exp();
+    let mut state = input[0];
+    input
+        .iter()
+        .scan(input[0], |last, &now| {
+            state = kept * state + (1.0 - kept) * 0.5 * (*last + now);
+            *last = now;
+            Some(state)
+        })
+        .collect()
+}
+
+/// Mean over the time before, by trapezia.
+fn window(input: &[f64], length: usize) -> Vec<f64> {
+    (0..input.len())
+        .map(|k| {
+            let inner: f64 = (1..length).map(|back| input[k.saturating_sub(back)]).sum();
+            (inner + 0.5 * (input[k] + input[k.saturating_sub(length)])) / length as f64
+        })
+        .collect()
+}
+
+fn explained(reading: &[f64], seed: u64) -> Report {
+    let current = load();
+    let rows = || (0..ROWS).map(|row| row * FINE);
+    let mut noise = noise(seed, NOISE_A);
+    let t_s: Vec<f64> = (0..ROWS).map(|row| row as f64 * STEP_S).collect();
+    let value = rows().map(|at| reading[at] + noise()).collect();
+    let problem = Problem {
+        view: View::Sensor,
+        name: "i_meas_a".into(),
+        unit: "A".into(),
+        drive: Drive {
+            t_s: t_s.clone().into(),
+            reference: rows().map(|at| current[at]).collect(),
+            segments: std::iter::once(0..ROWS).collect(),
+            continues: vec![false],
+            ..Drive::default()
+        },
+        observed: Observed::with_drive(t_s, value),
+        base: Base::Sensor(SensorBase::default()),
+        modelled: Vec::new(),
+        noise: NOISE_A,
+        coloured: Coloured::default(),
+        accuracy: Accuracy::default(),
+    };
+    said(problem, seed, &[])
+}
+
+/// The value of the one effect that is named, with the ids that it may be.
+fn only(report: &Report) -> (Vec<&str>, &ParameterReport) {
+    let [effect] = report.effects.as_slice() else {
+        panic!("{:?}", report.summary);
+    };
+    let others = effect.equivalent_to.iter().map(String::as_str);
+    let ids = std::iter::once(effect.id.as_str()).chain(others).collect();
+    (ids, &effect.parameters[0])
+}
+
+/// That the truth is within the interval, or beside it by no more than a tenth of what straight lines would make it.
+#[track_caller]
+fn assert_near(parameter: &ParameterReport, truth: f64, bias: f64) {
+    let [low, high] = parameter.ci95;
+    assert!(
+        low - 0.1 * bias <= truth && truth <= high + 0.1 * bias,
+        "{truth}: {parameter:?}"
+    );
+}
+
+#[test]
+fn a_delay_of_half_a_step_is_a_delay() {
+    let load = load();
+    let late: Vec<f64> = (0..load.len())
+        .map(|k| load[k.saturating_sub(FINE / 2)])
+        .collect();
+    for seed in 0..3 {
+        let report = explained(&late, seed);
+        let (ids, delay) = only(&report);
+        assert!(ids.contains(&"delay"), "{}", report.summary);
+        if ids[0] == "delay" {
+            assert!((delay.value - 0.05).abs() < 1e-3, "{delay:?}");
+        }
+        let course = "the reference is taken to go smoothly";
+        assert!(
+            report.remarks.iter().any(|remark| remark.contains(course)),
+            "{:?}",
+            report.remarks
+        );
+    }
+}
+
+#[test]
+fn a_window_and_a_lag_are_as_long_as_they_are() {
+    let load = load();
+    for seed in 0..3 {
+        let report = explained(&window(&load, 60), seed);
+        let (ids, found) = only(&report);
+        assert_eq!(ids[0], "moving-average", "{}", report.summary);
+        // By Δt²/6 of the variance w²/12 that straight lines add: Δt²/w.
+        assert_near(found, 0.6, STEP_S * STEP_S / 0.6);
+        let report = explained(&low_pass(&load, 0.3), seed);
+        let (ids, found) = only(&report);
+        assert_eq!(ids[0], "lag", "{}", report.summary);
+        assert_near(found, 0.3, STEP_S * STEP_S / (12.0 * 0.3));
+    }
+}
