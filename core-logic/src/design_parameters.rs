@@ -247,9 +247,9 @@ pub const SWITCHING_TOLERANCE: Microamps = Microamps::from_amps(1);
 pub const SLEW_LIMIT_AMPS_PER_SECOND: u32 = 10_000;
 /// Longest delay of the edge's time stamp: the edge handler's deadline.
 pub const EDGE_STAMP_DELAY_US: u64 = 5;
-/// Intervals at an edge up to this length are taken at the switching current. At the slew limit that errs by at most
-/// slew · T² / 2 = 20 mC, below the 30 mC that the hidden bits of the accumulator cost at every change of scale.
-pub const SHORT_INTERVAL_US: u32 = 2_000;
+/// Intervals with chatter up to this length are put together. At the slew limit that is worth doubting 10 A of the mean
+/// current at worst, as much as the 30 mC that the hidden bits of the accumulator cost at each edge less often than that.
+pub const SHORT_INTERVAL_US: u32 = 4_000;
 /// Error of the converter's current where it stands in for the meter: 1 % of the reading, the result of D2 …
 pub const BRIDGE_GAIN: Ppm = Ppm(10_000);
 /// … and 1 A beside it: six codes of 153 mA at 32 SPS on the coarsest sensor (D2).

@@ -46,13 +46,11 @@ pub struct EdgeRecorder {
     range: Range,
     /// Up to here the time is accounted for.
     accounted: Instant,
-    small: Duration,
     large: Duration,
     edges: u32,
     coalesced: u16,
     last_edge: Option<Instant>,
-    unseen: Duration,
-    suspended: Option<Instant>,
+    suspended: bool,
 }
 
 impl EdgeRecorder {
@@ -62,13 +60,11 @@ impl EdgeRecorder {
         Self {
             range: Range::from_flag(flag_high),
             accounted: now,
-            small: Duration::from_ticks(0),
             large: Duration::from_ticks(0),
             edges: 0,
             coalesced: 0,
             last_edge: None,
-            unseen: Duration::from_ticks(0),
-            suspended: None,
+            suspended: false,
         }
     }
 
@@ -99,21 +95,23 @@ impl EdgeRecorder {
         missed
     }
 
-    /// A storm has masked the edge interrupt: from `now` on the flag is not watched.
-    pub fn suspend(&mut self, now: Instant) {
-        if self.suspended.is_none() {
-            self.suspended = Some(now);
-        }
+    /// A storm has masked the edge interrupt: from here on the flag is not watched.
+    pub const fn suspend(&mut self) {
+        self.suspended = true;
     }
 
-    /// The edge interrupt is enabled again. What happened meanwhile is unknown, so a coalesced pair is recorded, the
-    /// edge as well when the level has changed, and the time since [`EdgeRecorder::suspend`] as unseen.
+    /// The edge interrupt is enabled again. What happened meanwhile is unknown, so a coalesced pair is recorded, and the
+    /// edge as well when the level has changed.
     pub fn resume(&mut self, now: Instant, flag_high: bool) {
-        if let Some(since) = self.suspended.take() {
-            self.unseen = self.unseen.saturating_add(elapsed(since, now));
-        }
+        self.suspended = false;
         let _changed = self.observe(now, flag_high);
         self.on_edge(now, flag_high);
+    }
+
+    /// Time of the newest edge, if there was any.
+    #[must_use]
+    pub const fn last_edge(&self) -> Option<Instant> {
+        self.last_edge
     }
 
     /// Everything up to `now`, as a copy.
@@ -127,14 +125,12 @@ impl EdgeRecorder {
         RangeHistory {
             range: upto.range,
             at: upto.accounted,
-            small: upto.small,
             large: upto.large,
             edges: upto.edges,
             coalesced: upto.coalesced,
             last_edge: upto.last_edge,
-            unseen: upto.suspended.map_or(upto.unseen, |since| {
-                upto.unseen.saturating_add(elapsed(since, now))
-            }),
+            watched: !upto.suspended,
+            high: upto.large,
         }
     }
 
@@ -143,11 +139,9 @@ impl EdgeRecorder {
         let Some(spent) = now.checked_duration_since(self.accounted) else {
             return;
         };
-        let total = match self.range {
-            Range::Small => &mut self.small,
-            Range::Large => &mut self.large,
-        };
-        *total = total.saturating_add(spent);
+        if self.range == Range::Large {
+            self.large = self.large.saturating_add(spent);
+        }
         self.accounted = now;
     }
 }
@@ -160,9 +154,7 @@ pub struct RangeHistory {
     pub range: Range,
     /// The instant of this copy.
     pub at: Instant,
-    /// Time in [`Range::Small`] so far.
-    pub small: Duration,
-    /// Time in [`Range::Large`] so far.
+    /// Time in [`Range::Large`] so far; the rest was spent in [`Range::Small`].
     pub large: Duration,
     /// Edges so far; wraps at 2³².
     pub edges: u32,
@@ -170,31 +162,30 @@ pub struct RangeHistory {
     pub coalesced: u16,
     /// Time of the newest edge, if there was any.
     pub last_edge: Option<Instant>,
-    /// Time during which the flag was not watched, so that the division into small and large is not known.
-    pub unseen: Duration,
+    /// Whether the edge interrupt is enabled at [`RangeHistory::at`].
+    pub watched: bool,
+    /// How long the flag was high so far by a counter that its level gates, which misses no edge; the time in
+    /// [`Range::Large`] where there is none.
+    pub high: Duration,
 }
 
 impl RangeHistory {
     /// No edge since the start of the board, all of the time in `range`: what a board with a single sensor hands on.
     #[must_use]
     pub const fn steady(now: Instant, range: Range) -> Self {
-        let (none, all) = (
-            Duration::from_ticks(0),
-            Duration::from_ticks(now.as_ticks()),
-        );
-        let (small, large) = match range {
-            Range::Small => (all, none),
-            Range::Large => (none, all),
-        };
+        let large = Duration::from_ticks(match range {
+            Range::Small => 0,
+            Range::Large => now.as_ticks(),
+        });
         Self {
             range,
             at: now,
-            small,
             large,
             edges: 0,
             coalesced: 0,
             last_edge: None,
-            unseen: Duration::from_ticks(0),
+            watched: true,
+            high: large,
         }
     }
 
@@ -202,24 +193,24 @@ impl RangeHistory {
     #[must_use]
     pub fn since(&self, earlier: &Self) -> RangeInterval {
         let edges = self.edges.wrapping_sub(earlier.edges);
+        let missed_edges = !self.watched
+            || !earlier.watched
+            || self.coalesced != earlier.coalesced
+            || (edges != 0 && self.coalesced == u16::MAX);
+        let (from, to) = if missed_edges {
+            (earlier.high, self.high)
+        } else {
+            (earlier.large, self.large)
+        };
+        let length = elapsed(earlier.at, self.at);
+        let large = to.saturating_sub(from).min(length);
         RangeInterval {
             first: earlier.range,
             last: self.range,
             edges,
-            coalesced: self.coalesced != earlier.coalesced
-                || (edges != 0 && self.coalesced == u16::MAX),
-            unseen: self
-                .unseen
-                .checked_sub(earlier.unseen)
-                .unwrap_or(Duration::from_ticks(0)),
-            small: self
-                .small
-                .checked_sub(earlier.small)
-                .unwrap_or(Duration::from_ticks(0)),
-            large: self
-                .large
-                .checked_sub(earlier.large)
-                .unwrap_or(Duration::from_ticks(0)),
+            missed_edges,
+            small: length.saturating_sub(large),
+            large,
             since_last_edge: self.last_edge.map(|edge| elapsed(edge, self.at)),
         }
     }
@@ -253,15 +244,13 @@ pub struct RangeInterval {
     pub last: Range,
     /// Edges in it; exact below 2³².
     pub edges: u32,
-    /// Whether some of the edges came as a coalesced pair, so that there may have been more and the times in the two
-    /// ranges are not exact.
-    pub coalesced: bool,
+    /// Whether there may have been more edges: some came as a coalesced pair, or the flag was not watched all the time.
+    /// The times in the two ranges are then those of [`RangeHistory::high`].
+    pub missed_edges: bool,
     /// Time in [`Range::Small`].
     pub small: Duration,
     /// Time in [`Range::Large`].
     pub large: Duration,
-    /// Time during which the flag was not watched.
-    pub unseen: Duration,
     /// From the newest edge to the interval's end; the edge may lie before the interval.
     pub since_last_edge: Option<Duration>,
 }
@@ -607,13 +596,7 @@ mod tests {
     fn times_and_edges_add_up() {
         let mut recorder = EdgeRecorder::new(at(100), false);
         let start = recorder.history(at(100));
-        assert_eq!(
-            start,
-            RangeHistory {
-                small: Duration::from_ticks(0),
-                ..RangeHistory::steady(at(100), Range::Small)
-            }
-        );
+        assert_eq!(start, RangeHistory::steady(at(100), Range::Small));
         recorder.on_edge(at(150), true);
         recorder.on_edge(at(170), false);
         let history = recorder.history(at(200));
@@ -622,12 +605,12 @@ mod tests {
             RangeHistory {
                 range: Range::Small,
                 at: at(200),
-                small: us(80),
                 large: us(20),
                 edges: 2,
                 coalesced: 0,
                 last_edge: Some(at(170)),
-                unseen: us(0),
+                watched: true,
+                high: us(20),
             }
         );
         let interval = history.since(&start);
@@ -637,10 +620,9 @@ mod tests {
                 first: Range::Small,
                 last: Range::Small,
                 edges: 2,
-                coalesced: false,
+                missed_edges: false,
                 small: us(80),
                 large: us(20),
-                unseen: us(0),
                 since_last_edge: Some(us(30)),
             }
         );
@@ -677,8 +659,8 @@ mod tests {
         assert_eq!((history.edges, history.coalesced), (2, 1));
         assert_eq!(history.range, Range::Small);
         assert_eq!(history.last_edge, Some(at(10)));
-        assert!(history.since(&before).coalesced);
-        assert!(!history.since(&history).coalesced);
+        assert!(history.since(&before).missed_edges);
+        assert!(!history.since(&history).missed_edges);
     }
 
     #[test]
@@ -690,9 +672,9 @@ mod tests {
         let before = recorder.history(at(1));
         assert_eq!(before.coalesced, u16::MAX);
         assert_eq!(before.edges, 140_000);
-        assert!(!recorder.history(at(2)).since(&before).coalesced);
+        assert!(!recorder.history(at(2)).since(&before).missed_edges);
         recorder.on_edge(at(3), false);
-        assert!(recorder.history(at(4)).since(&before).coalesced);
+        assert!(recorder.history(at(4)).since(&before).missed_edges);
     }
 
     #[test]
@@ -703,31 +685,46 @@ mod tests {
         assert!(recorder.observe(at(7), true));
         let history = recorder.history(at(9));
         assert_eq!((history.edges, history.range), (1, Range::Large));
-        assert_eq!((history.small, history.large), (us(7), us(2)));
+        assert_eq!(history.large, us(2));
     }
 
     #[test]
-    fn masked_time_is_unseen() {
+    fn unwatched_time_is_divided_by_the_gated_counter() {
         let mut recorder = EdgeRecorder::new(at(0), false);
-        let before = recorder.history(at(0));
-        recorder.suspend(at(10));
-        recorder.suspend(at(15));
-        assert_eq!(recorder.history(at(20)).since(&before).unseen, us(10));
+        let gated = |recorder: &EdgeRecorder, now, high| RangeHistory {
+            high: us(high),
+            ..recorder.history(at(now))
+        };
+        let start = gated(&recorder, 10, 0);
+        recorder.suspend();
+        let masked = gated(&recorder, 20, 7);
+        let resting = gated(&recorder, 25, 11);
         recorder.resume(at(30), false);
-        let history = recorder.history(at(40));
-        assert_eq!(history.unseen, us(20));
-        assert_eq!((history.edges, history.coalesced), (2, 1));
+        let resumed = gated(&recorder, 40, 12);
+        let later = gated(&recorder, 90, 99);
+        for (earlier, later, missed_edges, small, large) in [
+            (start, masked, true, 3, 7),
+            // Neither end is watched.
+            (masked, resting, true, 1, 4),
+            (resting, resumed, true, 14, 1),
+            (start, resumed, true, 18, 12),
+            // Where no edge is missed the time stamps are the exact ones.
+            (resumed, later, false, 50, 0),
+            // The counter is read a little later than the time.
+            (masked, later, true, 0, 70),
+        ] {
+            let interval = later.since(&earlier);
+            assert_eq!(interval.missed_edges, missed_edges);
+            assert_eq!((interval.small, interval.large), (us(small), us(large)));
+        }
+        assert_eq!((resumed.edges, resumed.coalesced), (2, 1));
         // With the level changed there is an edge more.
-        recorder.suspend(at(50));
-        recorder.resume(at(60), true);
-        let history = recorder.history(at(70));
-        assert_eq!(history.unseen, us(30));
+        recorder.suspend();
+        recorder.resume(at(95), true);
+        let history = recorder.history(at(97));
         assert_eq!((history.edges, history.coalesced), (5, 2));
         assert_eq!(history.range, Range::Large);
-        assert_eq!(history.last_edge, Some(at(60)));
-        // Without a suspension before it, nothing is unseen.
-        recorder.resume(at(80), true);
-        assert_eq!(recorder.history(at(80)).unseen, us(30));
+        assert_eq!(history.last_edge, Some(at(95)));
     }
 
     #[test]
@@ -737,7 +734,7 @@ mod tests {
         let history = recorder.history(at(20));
         assert_eq!(history.at, at(100));
         assert_eq!(history.last_edge, Some(at(100)));
-        assert_eq!((history.small, history.large), (us(0), us(0)));
+        assert_eq!(history.large, us(0));
         assert_eq!(recorder.history(at(110)).large, us(10));
     }
 
@@ -1032,7 +1029,7 @@ mod tests {
             }
             let last = histories.last().unwrap();
             prop_assert_eq!(last.large.as_ticks(), large);
-            prop_assert_eq!(last.small.as_ticks(), now - large);
+            prop_assert_eq!(last.since(histories.first().unwrap()).small.as_ticks(), now - large);
             for earlier in &histories {
                 let interval = last.since(earlier);
                 prop_assert_eq!(interval.length().as_ticks(), now - earlier.at.as_ticks());
@@ -1060,7 +1057,7 @@ mod tests {
             };
             for (time, flag) in times.into_iter().zip(flags) {
                 recorder.on_edge(at(time), flag);
-                recorder.suspend(at(time / 3));
+                recorder.suspend();
                 recorder.resume(at(time / 2), !flag);
                 let history = recorder.history(at(time));
                 let _ = (history.since(&first), first.since(&history), history.since(&first).shorter());

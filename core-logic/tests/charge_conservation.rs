@@ -19,7 +19,7 @@
 use core_logic::design_parameters as design;
 use core_logic::error_budget::{ProfileSummary, charge_bound};
 use core_logic::meter::{MeterChannel, MeterConfig, MeterReading, ReadingOutcome};
-use core_logic::range::{EdgeRecorder, Range};
+use core_logic::range::{EdgeRecorder, Range, RangeHistory};
 use core_logic::storm::{StormAction, StormConfig, StormGuard};
 use core_logic::units::{Duration, Instant, Microamps};
 use proptest::prelude::*;
@@ -27,6 +27,8 @@ use proptest::prelude::*;
 /// Counts per second at full scale, from the data sheet's quantities.
 const COUNTS_PER_SECOND: f64 = 1_677_722.0 * 0.2 * (3_579_545.0 / 4.0) / 33_554_432.0;
 const SWITCHING: f64 = 160.0 / 3.0;
+/// Intervals at an edge up to this length are chatter to the budget: taken at the switching current, slew · T² / 2 is 20 mC.
+const CHATTER_US: u64 = 2_000;
 
 /// A generator for everything random in a case (splitmix64).
 struct Random(u64);
@@ -58,8 +60,22 @@ impl Random {
 /// comparators toggles the range flag.
 #[derive(Clone, Copy, Debug)]
 enum Piece {
-    Ramp { to: f64, seconds: f64 },
-    Chatter { hertz: f64, duty: f64, seconds: f64 },
+    Ramp {
+        to: f64,
+        seconds: f64,
+    },
+    Chatter {
+        hertz: f64,
+        duty: f64,
+        seconds: f64,
+    },
+    /// The same of a comparator that is broken, at any current.
+    Broken {
+        amps: f64,
+        hertz: f64,
+        duty: f64,
+        seconds: f64,
+    },
 }
 
 /// What the firmware does around the measuring logic.
@@ -76,6 +92,8 @@ struct Board {
     timing: Timing,
     hysteresis: f64,
     crystal: f64,
+    /// Where sensor and meter end, of the range's full scale: their data sheets promise no more than 1.
+    clip: f64,
     // physics
     start_us: f64,
     now_us: f64,
@@ -85,6 +103,8 @@ struct Board {
     charge: f64,
     square: f64,
     below_no_load_s: f64,
+    /// How long the flag was high, as the counter that it gates has it.
+    high_us: f64,
     // handler and meter task
     recorder: EdgeRecorder,
     guard: StormGuard,
@@ -102,6 +122,8 @@ struct Board {
     chatter_squares: u64,
     chatter_runs: u32,
     in_run: bool,
+    /// Whether a reading has had to wait for the next one, or an edge was missed.
+    waited: bool,
 }
 
 impl Board {
@@ -112,6 +134,7 @@ impl Board {
         let mut board = Self {
             hysteresis: random.between(0.1, 0.8),
             crystal: 1.0 + random.between(-100e-6, 100e-6),
+            clip: random.between(1.0, 1.1),
             start_us,
             now_us: start_us,
             current: 0.0,
@@ -121,6 +144,7 @@ impl Board {
             charge: 0.0,
             square: 0.0,
             below_no_load_s: 0.0,
+            high_us: 0.0,
             recorder: EdgeRecorder::new(start, false),
             guard: StormGuard::new(),
             handler_at: None,
@@ -135,6 +159,7 @@ impl Board {
             chatter_squares: 0,
             chatter_runs: 0,
             in_run: false,
+            waited: false,
             random,
             timing,
         };
@@ -156,7 +181,10 @@ impl Board {
         assert!((at_us - self.now_us).abs() < 1e-6);
         let at = Instant::from_ticks(at_us as u64);
         let energy = (((self.counts.floor() as i64) << 40) >> 40) as i32;
-        let history = self.recorder.history(at);
+        let history = RangeHistory {
+            high: Duration::from_ticks(self.high_us as u64),
+            ..self.recorder.history(at)
+        };
         let outcome = self
             .channel
             .on_reading(MeterReading { energy, at }, history);
@@ -164,9 +192,16 @@ impl Board {
             !matches!(outcome, ReadingOutcome::Rejected(_)),
             "{outcome:?}"
         );
+        if outcome == ReadingOutcome::Waits {
+            // As the firmware does: the next reading is not left to the poll.
+            self.waited = true;
+            let soon = self.now_us + self.random.between(1_000.0, 2_000.0).floor();
+            self.poll_at = self.poll_at.min(soon);
+        }
+        self.waited |= history.coalesced != 0;
         let length = at_us as u64 - self.last_snapshot_us;
         let edges = history.edges.wrapping_sub(self.last_edges);
-        let short = u64::from(design::SHORT_INTERVAL_US);
+        let short = CHATTER_US;
         let after = history
             .last_edge
             .map_or(u64::MAX, |edge| at.as_ticks() - edge.as_ticks());
@@ -194,10 +229,11 @@ impl Board {
             Range::Large => 600.0,
         };
         let threshold = full_scale * 50e-6;
-        // Split where the current passes the no-load threshold, either sign.
+        let clip = full_scale * self.clip;
+        // Split where the current passes the no-load threshold or the end of the range, either sign.
         let mut cuts = vec![0.0, seconds];
         if slope != 0.0 {
-            for level in [-threshold, threshold] {
+            for level in [-clip, -threshold, threshold, clip] {
                 let cut = (level - self.current) / slope;
                 if cut > 0.0 && cut < seconds {
                     cuts.push(cut);
@@ -214,8 +250,13 @@ impl Board {
             if (0.5 * (a + b)).abs() < threshold {
                 self.below_no_load_s += to - from;
             } else {
-                self.counts += charge / full_scale * COUNTS_PER_SECOND * self.crystal;
+                let end = clip * (to - from);
+                self.counts +=
+                    charge.clamp(-end, end) / full_scale * COUNTS_PER_SECOND * self.crystal;
             }
+        }
+        if self.range == Range::Large {
+            self.high_us += until_us - self.now_us;
         }
         self.current += slope * seconds;
         self.now_us = until_us;
@@ -255,7 +296,7 @@ impl Board {
             self.handler_at = None;
             self.recorder.on_edge(now, flag);
             if self.guard.on_event(&StormConfig::RANGE_EDGE, now) == StormAction::Mask {
-                self.recorder.suspend(now);
+                self.recorder.suspend();
                 self.unmask_at = Some(self.now_us + f64::from(StormConfig::RANGE_EDGE.hold_off_us));
             }
             self.request_snapshot();
@@ -271,8 +312,8 @@ impl Board {
             self.snapshot_at = None;
             self.snapshot();
         } else if self.poll_at <= self.now_us {
-            self.snapshot();
             self.schedule_poll();
+            self.snapshot();
         }
     }
 
@@ -349,26 +390,42 @@ impl Board {
                     to: level,
                     seconds: approach,
                 });
-                let end = self.now_us + seconds * 1e6;
-                let mut high = true;
-                while self.now_us < end {
-                    let share = if high { duty } else { 1.0 - duty };
-                    let stay = share * 1e6 / hertz * self.random.between(0.7, 1.3);
-                    // The current itself moves a little as well.
-                    let target = level + self.random.between(-0.3, 0.3);
-                    let fastest = f64::from(design::SLEW_LIMIT_AMPS_PER_SECOND);
-                    let slope = ((target - self.current) / (stay * 1e-6)).clamp(-fastest, fastest);
-                    self.advance(self.now_us + stay, slope, false);
-                    self.edge();
-                    high = !high;
-                }
+                self.chatter(level, hertz, duty, seconds);
             }
+            Piece::Broken {
+                amps,
+                hertz,
+                duty,
+                seconds,
+            } => {
+                self.run(Piece::Ramp {
+                    to: amps,
+                    seconds: 0.0,
+                });
+                self.chatter(amps, hertz, duty, seconds);
+            }
+        }
+    }
+
+    fn chatter(&mut self, level: f64, hertz: f64, duty: f64, seconds: f64) {
+        let end = self.now_us + seconds * 1e6;
+        let mut high = true;
+        while self.now_us < end {
+            let share = if high { duty } else { 1.0 - duty };
+            let stay = share * 1e6 / hertz * self.random.between(0.7, 1.3);
+            // The current itself moves a little as well.
+            let target = level + self.random.between(-0.3, 0.3);
+            let fastest = f64::from(design::SLEW_LIMIT_AMPS_PER_SECOND);
+            let slope = ((target - self.current) / (stay * 1e-6)).clamp(-fastest, fastest);
+            self.advance(self.now_us + stay, slope, false);
+            self.edge();
+            high = !high;
         }
     }
 
     /// Waits until nothing is pending, reads once more, and compares: the error and its bound in C.
     fn finish(&mut self) -> (f64, f64) {
-        let end = (self.now_us + 3_000.0).ceil();
+        let end = (self.now_us + 8_000.0).ceil();
         self.advance(end, 0.0, true);
         self.snapshot();
         let report = self.channel.report();
@@ -395,7 +452,9 @@ impl Board {
             error.abs() <= own,
             "error {error} C beyond the reported {own} C: {report:?}"
         );
-        assert_eq!(report.hand_overs, self.edges);
+        if !self.waited {
+            assert_eq!(report.hand_overs, self.last_edges);
+        }
         (error, ideal)
     }
 }
@@ -426,6 +485,16 @@ fn timings() -> impl Strategy<Value = Timing> {
         )
 }
 
+/// As the firmware reads: every 20 ms, edges apart.
+fn firmware_timings() -> impl Strategy<Value = Timing> {
+    (30.0..100.0_f64, 0.0..4.0_f64).prop_map(|(snapshot_latency_us, handler_delay_us)| Timing {
+        shortest_poll_s: 0.02,
+        longest_poll_s: 0.021,
+        snapshot_latency_us,
+        handler_delay_us,
+    })
+}
+
 fn ramp() -> impl Strategy<Value = Piece> {
     let anywhere = -600.0..600.0_f64;
     let near_threshold = prop_oneof![50.0..56.0_f64, -56.0..-50.0_f64];
@@ -446,8 +515,35 @@ fn chatter() -> impl Strategy<Value = Piece> {
     })
 }
 
+fn broken() -> impl Strategy<Value = Piece> {
+    let amps = prop_oneof![Just(0.0), -110.0..110.0_f64];
+    (amps, chatter()).prop_map(|(amps, piece)| match piece {
+        Piece::Chatter {
+            hertz,
+            duty,
+            seconds,
+        } => Piece::Broken {
+            amps,
+            hertz,
+            duty,
+            seconds,
+        },
+        other => other,
+    })
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(300))]
+
+    /// The budget knows of comparators that chatter at their threshold; of any others the counter itself has to know.
+    #[test]
+    fn chatter_at_any_current_costs_no_more_than_is_declared(
+        seed: u64,
+        timing in firmware_timings(),
+        profile in prop::collection::vec(prop_oneof![ramp(), broken()], 1..8),
+    ) {
+        let _ = conserve(seed, timing, &profile);
+    }
 
     #[test]
     fn charge_is_conserved_on_ramps(
@@ -509,7 +605,7 @@ fn a_thousand_crossings_lose_no_more_than_the_bound_and_nothing_on_average() {
             .iter()
             .map(|piece| match piece {
                 Piece::Ramp { to, .. } => *to,
-                Piece::Chatter { .. } => 0.0,
+                Piece::Chatter { .. } | Piece::Broken { .. } => 0.0,
             })
             .sum::<f64>()
             .signum();
@@ -594,6 +690,46 @@ fn chatter_of_any_frequency_stays_within_the_bound() {
             "chatter at {hertz} Hz: worst error {:.3} of the bound, {:.2} % of the charge",
             worst.0,
             worst.1 * 100.0
+        );
+    }
+}
+
+/// The grid of a comparator that is broken: the error itself is small, and what is declared is not out of proportion.
+#[test]
+fn chatter_of_a_broken_comparator_is_counted_wherever_the_current_is() {
+    for hertz in [10.0, 100.0, 300.0, 1e3, 1e4, 1e5_f64] {
+        let (mut worst, mut most) = (0.0_f64, 0.0_f64);
+        for amps in [0.0, 5.0, -5.0, 30.0, -30.0, 53.0, -53.0, 100.0, -100.0] {
+            for duty in [0.1, 0.3, 0.5, 0.7, 0.9] {
+                let timing = Timing {
+                    shortest_poll_s: 0.02,
+                    longest_poll_s: 0.021,
+                    snapshot_latency_us: 100.0,
+                    handler_delay_us: 4.0,
+                };
+                let profile = [Piece::Broken {
+                    amps,
+                    hertz,
+                    duty,
+                    seconds: 1.5,
+                }];
+                let mut board = Board::new(7, timing, MeterConfig::default());
+                for piece in profile {
+                    board.run(piece);
+                }
+                let (error, _) = board.finish();
+                let declared = board.channel.report().uncertainty.get() as f64 * 1e-9;
+                // Beyond the small sensor's end what it does not show is missing, and declared.
+                if amps.abs() < 60.0 {
+                    worst = worst.max(error.abs());
+                    most = most.max(declared);
+                }
+            }
+        }
+        println!("{hertz} Hz for 1.5 s: error at most {worst:.3} C, declared at most {most:.2} C");
+        assert!(
+            worst < 4.0 && most < 25.0,
+            "{hertz} Hz: {worst} C, {most} C"
         );
     }
 }

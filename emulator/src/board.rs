@@ -24,6 +24,8 @@ pub mod pins {
 
     /// Range flag.
     pub const RANGE_FLAG: Pin = Pin::new('A', 0);
+    /// The same line at the gate of TIM4.
+    pub const RANGE_GATE: Pin = Pin::new('B', 6);
     /// RS485 driver enable.
     pub const RS485_DRIVER: Pin = Pin::new('A', 1);
     /// Chip select of the ADE7753.
@@ -383,6 +385,7 @@ impl Board {
     fn drive_levels(&mut self, now: Ticks) {
         let flag = faulty(self.flag_fault, self.flag, now);
         self.levels.set(pins::RANGE_FLAG, Some(flag));
+        self.levels.set(pins::RANGE_GATE, Some(flag));
         // Open drain: high is nobody's doing but the pull-up's.
         let irq_high = faulty(self.irq_fault, !self.meter.irq_low(), now);
         self.levels

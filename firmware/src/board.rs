@@ -6,11 +6,11 @@ use core_logic::{
     design_parameters::METER_SPI_HZ,
     range::{EdgeRecorder, RangeHistory},
     storm::{StormAction, StormConfig, StormGuard},
-    units::Instant,
+    units::{Duration, Instant},
 };
 use stm32f4xx_hal::{
     gpio::{Edge, ExtiPin, GpioExt, Input, Output, PA0, PA4, PB12, PC4, PinState, Speed},
-    pac::{self, EXTI, SPI1, SPI2},
+    pac::{self, EXTI, RCC, SPI1, SPI2, TIM4},
     rcc::{Enable, Reset},
     syscfg::SysCfgExt,
 };
@@ -42,11 +42,48 @@ const FLASH_SPI: spi::Settings = spi::Settings {
 /// I/O AC characteristics, 2.7 … 3.6 V; *assumed*, as in the emulator). The meter's 2.625 MHz and all else stay below.
 const FLASH_EDGES: Speed = Speed::High;
 
+/// How long the range flag has been high: TIM4 counts microseconds while its channel 1, the same line, is high. It sees what
+/// no interrupt is fast enough for.
+struct HighTime {
+    timer: TIM4,
+    counted: u16,
+    total: Duration,
+}
+
+impl HighTime {
+    fn start(timer: TIM4, rcc: &mut RCC) -> Self {
+        TIM4::enable(rcc);
+        TIM4::reset(rcc);
+        timer.psc().write(|w| w.psc().set(time::PRESCALER));
+        timer.ccmr1_input().write(|w| w.cc1s().ti1());
+        timer.smcr().write(|w| w.ts().ti1fp1().sms().gated_mode());
+        // The prescaler takes effect with an update event.
+        timer.egr().write(|w| w.ug().set_bit());
+        timer.cr1().write(|w| w.cen().set_bit());
+        Self {
+            timer,
+            counted: 0,
+            total: Duration::from_ticks(0),
+        }
+    }
+
+    /// Up to now. Exact while it is asked once in 65 ms at least; the tick asks every 10 ms.
+    fn read(&mut self) -> Duration {
+        let count = self.timer.cnt().read().cnt().bits();
+        let passed = count.wrapping_sub(core::mem::replace(&mut self.counted, count));
+        self.total = self
+            .total
+            .saturating_add(Duration::from_ticks(passed.into()));
+        self.total
+    }
+}
+
 /// The range flag with its interrupt, and the external interrupts' mask that both lines share.
 pub struct Edges {
     exti: EXTI,
     flag: PA0<Input>,
     recorder: EdgeRecorder,
+    high: HighTime,
     guard: StormGuard,
     config: StormConfig,
 }
@@ -61,7 +98,7 @@ impl Edges {
         self.recorder.on_edge(now, self.flag.is_high());
         if self.guard.on_event(&self.config, now) == StormAction::Mask {
             self.flag.disable_interrupt(&mut self.exti);
-            self.recorder.suspend(now);
+            self.recorder.suspend();
         }
     }
 
@@ -80,9 +117,17 @@ impl Edges {
         }
     }
 
-    /// Everything up to `now`.
-    pub fn history(&self, now: Instant) -> RangeHistory {
-        self.recorder.history(now)
+    /// The newest edge.
+    pub const fn last_edge(&self) -> Option<Instant> {
+        self.recorder.last_edge()
+    }
+
+    /// Everything up to `now`; how long the flag was high up to the call.
+    pub fn history(&mut self, now: Instant) -> RangeHistory {
+        RangeHistory {
+            high: self.high.read(),
+            ..self.recorder.history(now)
+        }
     }
 
     /// Whether the edge interrupt rests after a storm.
@@ -197,8 +242,8 @@ impl Board {
         let c = dp.GPIOC.split(&mut rcc);
         let (mut exti, mut syscfg) = (dp.EXTI, dp.SYSCFG.constrain(&mut rcc));
 
-        // The pin table; docs/firmware.md shows it with the outside's names. PA0 and PA6 may see 5 V, which their pads
-        // stand only with the internal pulls off.
+        // The pin table; docs/firmware.md shows it with the outside's names. PA0, PA6 and PB6 may see 5 V, which their
+        // pads stand only with the internal pulls off.
         let mut range_flag = /*  PA0  */ a.pa0.into_floating_input();
         let rs485_driver = /*    PA1  */ a.pa1.into_push_pull_output_in_state(PinState::Low);
         let _rs485_tx = /*       PA2  */ a.pa2.into_alternate::<7>();
@@ -209,6 +254,7 @@ impl Board {
         let _meter_mosi = /*     PA7  */ a.pa7.into_alternate::<5>();
         let _can_rx = /*         PA11 */ a.pa11.into_alternate::<9>().internal_pull_up(true);
         let _can_tx = /*         PA12 */ a.pa12.into_alternate::<9>();
+        let _range_gate = /*     PB6  */ b.pb6.into_alternate::<2>();
         let i2c_clock = /*       PB8  */ b.pb8.into_alternate_open_drain::<4>();
         let i2c_data = /*        PB9  */ b.pb9.into_alternate_open_drain::<4>();
         let flash_select = /*    PB12 */ b.pb12.into_push_pull_output_in_state(PinState::High);
@@ -244,6 +290,7 @@ impl Board {
                 exti,
                 flag: range_flag,
                 recorder,
+                high: HighTime::start(dp.TIM4, &mut rcc),
                 guard: StormGuard::new(),
                 config: configuration.edge_storm,
             },

@@ -359,6 +359,8 @@ mod app {
         let mut edge_at = None;
         // A storm's beginning and end have snapshots of their own, so that the time without edges stands alone.
         let (mut bound, mut storms_seen) = (false, 0);
+        // The newest reading waits for another one.
+        let mut waits = false;
         loop {
             let now = time::now();
             let events = METER_EVENTS.swap(0, Ordering::AcqRel);
@@ -367,7 +369,7 @@ mod app {
                 let (last_edge, storms) = cx
                     .shared
                     .edges
-                    .lock(|edges| (edges.history(now).last_edge, edges.storms()));
+                    .lock(|edges| (edges.last_edge(), edges.storms()));
                 edge_at = edge_at.or(last_edge);
                 bound |= core::mem::replace(&mut storms_seen, storms) != storms;
             }
@@ -385,7 +387,7 @@ mod app {
             let mut worked = true;
             if edge && (core::mem::take(&mut bound) || meter.may_snapshot(now)) {
                 edge = false;
-                meter.snapshot(
+                waits = meter.snapshot(
                     |at| cx.shared.edges.lock(|edges| edges.history(at)),
                     &bridge,
                 );
@@ -410,7 +412,7 @@ mod app {
                 polls = polls.saturating_add(1);
                 fetch = polls.saturating_add(TEMPERATURE_AFTER_POLLS) == next_temperature;
                 if meter.is_counting() {
-                    meter.snapshot(
+                    waits = meter.snapshot(
                         |at| cx.shared.edges.lock(|edges| edges.history(at)),
                         &bridge,
                     );
@@ -437,7 +439,7 @@ mod app {
             }
 
             let masked = cx.shared.edges.lock(|edges| edges.is_masked());
-            let until = if edge || masked {
+            let until = if edge || masked || waits {
                 // The rest after a storm ends 1 … 2 ms after its beginning.
                 Mono::now() + 1.millis()
             } else {
@@ -457,7 +459,7 @@ mod app {
                     (found, irq, edges.storms().saturating_add(line.storms()))
                 });
             cx.shared.meter_link.lock(|link| link.storms = storms);
-            edge |= found;
+            edge |= found | core::mem::take(&mut waits);
             bound |= found;
             interrupt |= irq;
             if Mono::now() >= next_poll {

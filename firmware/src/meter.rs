@@ -209,12 +209,12 @@ impl Meter {
     }
 
     /// Reads AENERGY and hands it to the charge, with the range history of the instant at which it was latched.
-    /// `bridge`: what is known of the current if there was a gap.
+    /// `bridge`: what is known of the current if there was a gap. Whether the reading waits for the next one.
     pub fn snapshot(
         &mut self,
         mut history: impl FnMut(Instant) -> RangeHistory,
         bridge: &GapBridge,
-    ) {
+    ) -> bool {
         for attempt in 0..ATTEMPTS {
             let started = time::now();
             let before = history(started);
@@ -230,7 +230,11 @@ impl Meter {
                     continue;
                 }
             };
-            let after = history(reading.at);
+            // At the reading the gated counter is asked before the transfer, each time by as much.
+            let after = RangeHistory {
+                high: before.high,
+                ..history(reading.at)
+            };
             let last = attempt + 1 == ATTEMPTS;
             if after.edges != before.edges && !last {
                 // An edge during the transfer: nobody can tell on which side of it the register was latched.
@@ -242,7 +246,7 @@ impl Meter {
                     Ok(true) => {}
                     Ok(false) => {
                         self.lose(reading.at, 0);
-                        return;
+                        return false;
                     }
                     Err(error) => {
                         self.note_repeat(attempt, &error);
@@ -252,17 +256,18 @@ impl Meter {
             }
             if core::mem::take(&mut self.gap) {
                 self.channel.on_meter_restarted(reading, after, bridge);
-                return;
+                return false;
             }
             match self.channel.on_reading(reading, after) {
                 ReadingOutcome::Rejected(Rejection::RateOfChange) if !last => {}
                 ReadingOutcome::Rejected(Rejection::TooLate | Rejection::Lost) => {
                     self.channel.on_meter_restarted(reading, after, bridge);
-                    return;
+                    return false;
                 }
-                _ => return,
+                outcome => return outcome == ReadingOutcome::Waits,
             }
         }
+        false
     }
 
     fn note_repeat(&mut self, attempt: u8, error: &Error<spi::Error>) {

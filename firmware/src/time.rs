@@ -14,8 +14,8 @@ use stm32f4xx_hal::{
 
 static HALF_PERIODS: AtomicU32 = AtomicU32::new(0);
 
-/// TIM2's clock is twice APB1's: 84 MHz.
-const PRESCALER: u16 = 84 - 1;
+/// To 1 MHz: the timers' clock is twice APB1's, 84 MHz.
+pub const PRESCALER: u16 = 84 - 1;
 
 /// Starts the counter from zero.
 pub fn start(timer: TIM2, rcc: &mut RCC) {

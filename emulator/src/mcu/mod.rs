@@ -20,6 +20,7 @@ pub mod system_memory;
 #[cfg(test)]
 mod test_world;
 pub mod tim2;
+pub mod tim4;
 pub mod usart;
 mod word;
 

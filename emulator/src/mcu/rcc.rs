@@ -90,6 +90,8 @@ pub enum PeripheralId {
     GpioC,
     /// TIM2.
     Tim2,
+    /// TIM4.
+    Tim4,
     /// SPI2.
     Spi2,
     /// USART2.
@@ -110,11 +112,12 @@ pub enum PeripheralId {
 
 impl PeripheralId {
     /// All of them.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::GpioA,
         Self::GpioB,
         Self::GpioC,
         Self::Tim2,
+        Self::Tim4,
         Self::Spi2,
         Self::Usart2,
         Self::I2c1,
@@ -141,6 +144,7 @@ impl PeripheralId {
             Self::GpioB => (0, 1),
             Self::GpioC => (0, 2),
             Self::Tim2 => (3, 0),
+            Self::Tim4 => (3, 2),
             Self::Spi2 => (3, 14),
             Self::Usart2 => (3, 17),
             Self::I2c1 => (3, 21),
@@ -1008,6 +1012,7 @@ mod tests {
             (PeripheralId::GpioB, 0x30, 1),
             (PeripheralId::GpioC, 0x30, 2),
             (PeripheralId::Tim2, 0x40, 0),
+            (PeripheralId::Tim4, 0x40, 2),
             (PeripheralId::Spi2, 0x40, 14),
             (PeripheralId::Usart2, 0x40, 17),
             (PeripheralId::I2c1, 0x40, 21),

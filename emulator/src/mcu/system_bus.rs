@@ -7,7 +7,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use rsemu::core::error::BusError;
 use rsemu::core::space::{MemAttrs, MemOps, MemResult};
 
-use crate::board::Board;
+use crate::board::{Board, pins};
 use crate::can_bus::CanBus;
 use crate::mcu::adc::Adc1;
 use crate::mcu::exti::Exti;
@@ -19,6 +19,7 @@ use crate::mcu::rcc::{PeripheralId, Rcc, ResetCause};
 use crate::mcu::spi::Spi;
 use crate::mcu::syscfg::Syscfg;
 use crate::mcu::tim2::Tim2;
+use crate::mcu::tim4::Tim4;
 use crate::mcu::usart::Usart;
 use crate::mcu::{Clocks, Context, Interrupts, Peripheral, Unmodelled};
 use crate::outside::{Outputs, Outside, PORTS, Pin, SpiBus};
@@ -27,6 +28,8 @@ use crate::time::Ticks;
 
 /// Base of the peripherals' address range.
 const BASE: u32 = 0x4000_0000;
+/// The alternate function that is TIM4's (STM32F405 data sheet, alternate function mapping).
+const TIM4_CHANNEL_1: u8 = 2;
 /// Bit rate of the vehicle's bus.
 const CAN_BIT_RATE: u32 = 500_000;
 
@@ -60,6 +63,7 @@ struct State {
     exti: Exti,
     syscfg: Syscfg,
     tim2: Tim2,
+    tim4: Tim4,
     iwdg: Iwdg,
     adc1: Adc1,
     spi1: Spi,
@@ -129,6 +133,7 @@ enum Block {
     Exti,
     Syscfg,
     Tim2,
+    Tim4,
     Iwdg,
     Adc1,
     Spi1,
@@ -143,6 +148,7 @@ impl Block {
     const fn at(address: u32) -> Option<(Self, u32, Option<PeripheralId>)> {
         Some(match address {
             0x4000_0000..=0x4000_03FF => (Self::Tim2, 0x4000_0000, Some(PeripheralId::Tim2)),
+            0x4000_0800..=0x4000_0BFF => (Self::Tim4, 0x4000_0800, Some(PeripheralId::Tim4)),
             0x4000_3000..=0x4000_33FF => (Self::Iwdg, 0x4000_3000, None),
             0x4000_3800..=0x4000_3BFF => (Self::Spi2, 0x4000_3800, Some(PeripheralId::Spi2)),
             0x4000_4400..=0x4000_47FF => (Self::Usart2, 0x4000_4400, Some(PeripheralId::Usart2)),
@@ -194,6 +200,7 @@ impl State {
             Block::Exti => call!(self, now, exti.read(offset, bytes)),
             Block::Syscfg => call!(self, now, syscfg.read(offset, bytes)),
             Block::Tim2 => call!(self, now, tim2.read(offset, bytes)),
+            Block::Tim4 => call!(self, now, tim4.read(offset, bytes)),
             Block::Iwdg => call!(self, now, iwdg.read(offset, bytes)),
             Block::Adc1 => call!(self, now, adc1.read(offset, bytes)),
             Block::Spi1 => call!(self, now, spi1.read(offset, bytes)),
@@ -217,6 +224,7 @@ impl State {
             Block::Exti => call!(self, now, exti.write(offset, bytes, value)),
             Block::Syscfg => call!(self, now, syscfg.write(offset, bytes, value)),
             Block::Tim2 => call!(self, now, tim2.write(offset, bytes, value)),
+            Block::Tim4 => call!(self, now, tim4.write(offset, bytes, value)),
             Block::Iwdg => call!(self, now, iwdg.write(offset, bytes, value)),
             Block::Adc1 => call!(self, now, adc1.write(offset, bytes, value)),
             Block::Spi1 => call!(self, now, spi1.write(offset, bytes, value)),
@@ -286,6 +294,7 @@ impl State {
                 PeripheralId::GpioB => self.gpio.reset_port(1),
                 PeripheralId::GpioC => self.gpio.reset_port(2),
                 PeripheralId::Tim2 => call!(self, now, tim2.reset()),
+                PeripheralId::Tim4 => call!(self, now, tim4.reset()),
                 PeripheralId::Spi1 => call!(self, now, spi1.reset()),
                 PeripheralId::Spi2 => call!(self, now, spi2.reset()),
                 PeripheralId::Usart2 => call!(self, now, usart2.reset()),
@@ -309,7 +318,7 @@ impl State {
         self.follow_levels(now);
     }
 
-    /// Pins that changed reach EXTI.
+    /// Pins that changed reach EXTI and the gate of TIM4.
     fn follow_levels(&mut self, now: Ticks) {
         let driven = self.board.levels(now);
         let levels = self.gpio.input_levels(&driven);
@@ -317,6 +326,12 @@ impl State {
             self.exti
                 .on_levels(self.levels, levels, &self.syscfg, &self.interrupts);
             self.levels = levels;
+        }
+        let Pin { port, number } = pins::RANGE_GATE;
+        let gate = levels[usize::from(port)] >> number & 1 != 0
+            && self.gpio.alternate(pins::RANGE_GATE) == Some(TIM4_CHANNEL_1);
+        if gate != self.tim4.gate() {
+            call!(self, now, tim4.set_gate(gate));
         }
     }
 
@@ -371,7 +386,7 @@ impl State {
             };
         }
         all!(
-            rcc, flash, gpio, exti, syscfg, tim2, iwdg, adc1, spi1, spi2, i2c1, usart2, can
+            rcc, flash, gpio, exti, syscfg, tim2, tim4, iwdg, adc1, spi1, spi2, i2c1, usart2, can
         );
         self.rcc.set_reset_cause(cause);
         self.clocks = self.rcc.clocks();
@@ -392,6 +407,7 @@ impl SystemBus {
             exti: Exti::new(),
             syscfg: Syscfg::new(),
             tim2: Tim2::new(),
+            tim4: Tim4::new(),
             iwdg: Iwdg::default(),
             adc1: Adc1::default(),
             spi1: Spi::new(SpiBus::Meter),

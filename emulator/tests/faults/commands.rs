@@ -166,13 +166,8 @@ fn fault_f26_range_changes_during_calibration_save_and_bus_errors() {
             declared_c * 1e3,
             unexpected(&rig, &[])
         );
-        // Away from the threshold chatter is booked wrongly: see F9.
-        let away_a = if current_a.abs() < 52.0 {
-            54.4 - current_a.abs()
-        } else {
-            0.0
-        };
-        assert!(error_c.abs() <= declared_c + away_a * 2.2, "{error_c}");
+        assert!(error_c.abs() <= declared_c, "{error_c}");
+        assert!(error_c.abs() < 0.5, "{error_c}");
         assert!(rig.view.charge_c().validity == 0);
         assert_eq!(resets(&rig), 0);
     }

@@ -16,7 +16,7 @@ fn edges(rig: &mut emulator::rig::Rig<'_>) -> (u32, u32) {
 fn fault_f09_chatter_loses_no_edge_and_stays_within_the_declared_charge() {
     // What one change may cost behind ideal sensors.
     let per_edge_c = (hand_over_hidden() + hand_over_latency()) as f64 * 1e-9;
-    // Chatter is at home at the threshold; the slow ones also where nobody would expect them.
+    // Chatter is at home at the threshold; that of a broken comparator may be anywhere.
     for (pattern, current_a) in [
         ("10Hz,50%", 53.3),
         ("10Hz,20%", 20.0),
@@ -27,6 +27,11 @@ fn fault_f09_chatter_loses_no_edge_and_stays_within_the_declared_charge() {
         ("10kHz,30%", -53.3),
         ("100kHz,50%", 53.3),
         ("100kHz,10%", 53.3),
+        ("100Hz,50%", 0.0),
+        ("3kHz,50%", -30.0),
+        ("10kHz,30%", 30.0),
+        ("100kHz,90%", 5.0),
+        ("1kHz,50%", 100.0),
     ] {
         let mut rig = pulse(current_a, 2.2);
         let before = charges_c(&mut rig);
@@ -61,18 +66,15 @@ fn fault_f09_chatter_loses_no_edge_and_stays_within_the_declared_charge() {
         } else {
             assert_eq!(u64::from(counted) + 2 * u64::from(coalesced), truth.edges);
         }
-        // Chatter is booked at the switching current, where comparators do it. Elsewhere it is a broken comparator, and the
-        // charge is off by what lies between.
-        let away_a = if current_a.abs() < 52.0 {
-            54.4 - current_a.abs()
-        } else {
-            0.0
-        };
-        let declared_c = declared_c.unwrap() + away_a * 1.6;
         assert!(
-            error_c.abs() <= declared_c + quantum_c(Range::Large),
+            error_c.abs() <= declared_c.unwrap() + quantum_c(Range::Large),
             "{pattern}: {error_c}"
         );
+        // What the small sensor does not show of 100 A nobody knows. Else it is as right as without chatter, but for the
+        // edges' snapshots, which are taken to be at the threshold where they stand alone.
+        if current_a < 60.0 {
+            assert!(error_c.abs() < 1.5, "{pattern}: {error_c}");
+        }
         if truth.edges < 200 {
             let bound_c = truth.edges as f64 * per_edge_c + quantum_c(Range::Large);
             assert!(
