@@ -330,6 +330,11 @@ pub trait Effect: Sync {
         None
     }
 
+    /// The parameter that says how a recording begins, if there is one: its first rows tell it and no others.
+    fn beginning(&self) -> Option<usize> {
+        None
+    }
+
     /// What follows from the values, in plain words.
     fn consequences(&self, _values: &[f64], _problem: &Problem) -> Vec<String> {
         Vec::new()

@@ -100,8 +100,7 @@ impl Effect for CoreHysteresis {
     }
 
     fn near(&self, values: &[f64], _scale: &Scale, share: f64) -> Option<Vec<Vec<f64>>> {
-        let before = values.len() - 1;
-        self.card.parameters[before].internal.then(|| {
+        self.beginning().map(|before| {
             [5.0 * share, -5.0 * share]
                 .map(|step| {
                     let mut near = values.to_vec();
@@ -114,11 +113,11 @@ impl Effect for CoreHysteresis {
 
     /// What a file begins with is its own: anything from one remanence to the other.
     fn turn(&self, _values: &[f64]) -> Option<f64> {
-        self.card
-            .parameters
-            .iter()
-            .any(|p| p.internal)
-            .then_some(2.0)
+        self.beginning().map(|_| 2.0)
+    }
+
+    fn beginning(&self) -> Option<usize> {
+        self.card.parameters.iter().position(|p| p.internal)
     }
 
     /// The sign that a relay keeps changes at once, where a turn of the current just reaches it.
@@ -158,7 +157,15 @@ impl Effect for CoreHysteresis {
             // A core keeps a field in the direction of what flowed.
             0 => (0.0, 0.2 * scale.full_scale),
             // A loop narrower than a hundredth of the range is no loop: it would follow the noise of the reference.
-            1 => (1e-2 * scale.full_scale, 0.5 * scale.full_scale),
+            1 => {
+                let low = 1e-2 * scale.full_scale;
+                let high = 0.5 * scale.full_scale;
+                match self.form {
+                    // A magnetisation that is hardly ever turned over is any zero that drifts.
+                    Form::Added => (low, high.min(scale.both_ways).max(low)),
+                    _ => (low, high),
+                }
+            }
             // From relays that switch at once to loops with no flat part.
             2 if self.form == Form::Closed => (0.1, 4.0),
             // From relays to a play without end.
@@ -182,7 +189,14 @@ impl Effect for CoreHysteresis {
             Form::Added => &[&[0.2, 0.1, 0.0], &[0.7, 0.35, 0.0], &[2.5, 0.5, 0.0]],
         };
         let narrow = (0.01 * scale.largest).max(1.01e-2 * scale.full_scale);
-        spaced(narrow, (0.4 * scale.largest).max(2.0 * narrow), count)
+        let mut wide = (0.4 * scale.largest).max(2.0 * narrow);
+        if self.form == Form::Added {
+            wide = wide.min(0.9 * scale.both_ways);
+            if wide <= narrow {
+                return Vec::new();
+            }
+        }
+        spaced(narrow, wide, count)
             .into_iter()
             .flat_map(|coercivity| {
                 shapes.iter().map(move |shape| {
@@ -318,7 +332,8 @@ struct Plays {
 
 /// From −1 to 1 over a width of one to each side, without an edge.
 fn bend(x: f64) -> f64 {
-    let x = ramp(x);
+    let x = if x > 1.0 { 1.0 } else { x };
+    let x = if x < -1.0 { -1.0 } else { x };
     x * (1.5 - 0.5 * x * x)
 }
 
@@ -337,14 +352,20 @@ impl Plays {
 
     /// Adds what the core keeps; `before` the first row it had kept a share of the remanence.
     fn add(&self, before: f64, signal: &mut [f64]) {
-        let mut plays = self.half_widths_a.map(|c| before * c);
+        // In units of the curve's width, side by side.
+        let half_widths = self.half_widths_a.map(|c| c * self.per_a);
+        let mut plays = half_widths.map(|c| before * c);
         for value in signal {
-            let mut sum = 0.0;
-            for (play, c) in plays.iter_mut().zip(&self.half_widths_a) {
-                *play = play.max(*value - c).min(*value + c);
-                sum += bend(*play * self.per_a);
+            let here = *value * self.per_a;
+            let mut kept = [0.0; PLAYS];
+            for k in 0..PLAYS {
+                let (low, high) = (here - half_widths[k], here + half_widths[k]);
+                let play = if plays[k] < low { low } else { plays[k] };
+                plays[k] = if play > high { high } else { play };
+                kept[k] = bend(plays[k]);
             }
-            *value += self.weight * sum;
+            let [a, b, c, d, e, f, g, h] = kept;
+            *value += self.weight * (((a + b) + (c + d)) + ((e + f) + (g + h)));
         }
     }
 }
