@@ -330,6 +330,11 @@ pub trait Effect: Sync {
         None
     }
 
+    /// Whether it is a curve of the present current with a memory, and named for the memory.
+    fn remembers(&self) -> bool {
+        false
+    }
+
     /// The parameter that says how a recording begins, if there is one: its first rows tell it and no others.
     fn beginning(&self) -> Option<usize> {
         None

@@ -3,7 +3,8 @@
 use plant::magnetic_core::{MagneticCore, MagneticCoreConfig, MagneticCoreState};
 
 use super::scene::{Scale, Scene};
-use super::{BENT, Card, Clues, Effect, IDEALISED, Parameter, STRAIGHT, Search, Stage, spaced};
+use super::{Card, Clues, Effect, IDEALISED, Parameter, STRAIGHT, Search, Stage, spaced};
+use crate::problem::Problem;
 
 /// A core with an air gap, a closed one, or one that adds its magnetisation: one id, and as many parameters as each needs.
 #[derive(Debug)]
@@ -64,22 +65,17 @@ static DRAGGING: [Parameter; 4] = [
 const BEFORE: Parameter = Parameter::internal("before", "1", 0.0, Search::Stepped);
 
 static CARDS: [Card; 4] = [
-    card(
-        "y = i − w·Σₖ stopₖ(i), stops at cₖ = (0.5, 0.75, 1, 1.25, 1.5)·coercivity (Prandtl–Ishlinskii), w so that remanence is left after a swing to full range and back",
-        PARAMETERS.as_slice().split_at(2).0,
-    ),
-    card(
-        "y = i + w·Σₖ (relayₖ(i) − ramp(i, sₖ)), sₖ = spread·cₖ, cₖ = (0.5, 0.75, 1, 1.25, 1.5)·coercivity; relayₖ = ramp(i − cₖ, sₖ) after −cₖ − sₖ, ramp(i + cₖ, sₖ) after cₖ + sₖ (from one to the other over the last eighth); ramp(x, s) = min(max(x/s, −1), 1) (Preisach: a closed core); without spread, a core with a gap: y = i − w·Σₖ stop(i, ±cₖ) (Prandtl–Ishlinskii); w so that remanence is left after a swing to full range and back",
-        PARAMETERS.as_slice().split_at(3).0,
-    ),
-    card(EQUATION_ADDED, PARAMETERS.as_slice()),
-    card(
-        "y = i − remanence·z, dz/di = (1 − abs(z)·(beta·sgn(z·di) + 1 − beta))/c (Bouc–Wen), c = coercivity·(2·beta − 1)/ln(2·beta)",
-        DRAGGING.as_slice(),
-    ),
+    card(GAPPED_EQUATION, PARAMETERS.as_slice().split_at(2).0),
+    card(CLOSED_EQUATION, PARAMETERS.as_slice().split_at(3).0),
+    card(ADDED_EQUATION, PARAMETERS.as_slice()),
+    card(DRAGGED_EQUATION, DRAGGING.as_slice()),
 ];
 
-const EQUATION_ADDED: &str = "y = i + w·Σₖ S(playₖ(i)/(spread·coercivity)), playₖ of half width cₖ = coercivity·exp(scatter·zₖ), zₖ: eight quantiles of a normal distribution, S(x) = (3x − x³)/2 up to ±1 (Preisach, its density a product); w so that remanence is left after saturation";
+const GAPPED_EQUATION: &str = "y = i − w·Σₖ stopₖ(i), stops at cₖ = (0.5, 0.75, 1, 1.25, 1.5)·coercivity (Prandtl–Ishlinskii), w so that remanence is left after a swing to full range and back";
+const CLOSED_EQUATION: &str = "y = i + w·Σₖ (relayₖ(i) − ramp(i, sₖ)), sₖ = spread·cₖ, cₖ = (0.5, 0.75, 1, 1.25, 1.5)·coercivity; relayₖ = ramp(i − cₖ, sₖ) after −cₖ − sₖ, ramp(i + cₖ, sₖ) after cₖ + sₖ (from one to the other over the last eighth); ramp(x, s) = min(max(x/s, −1), 1) (Preisach: a closed core); w so that remanence is left after a swing to full range and back";
+const DRAGGED_EQUATION: &str = "y = i − remanence·z, dz/di = (1 − abs(z)·(beta·sgn(z·di) + 1 − beta))/c (Bouc–Wen), c = coercivity·(2·beta − 1)/ln(2·beta)";
+/// The fullest form speaks for all of them in the table.
+const ADDED_EQUATION: &str = "y = i + w·Σₖ S(playₖ(i)/(spread·coercivity)), playₖ of half width coercivity·exp(scatter·zₖ), zₖ: eight quantiles of a normal distribution, S(x) = (3x − x³)/2 up to ±1 (Preisach: a magnetisation that is added); w so that remanence is left after saturation. Without scatter: y = i + w·Σₖ (relayₖ(i) − ramp(i, sₖ)), sₖ = spread·cₖ, cₖ = (0.5, 0.75, 1, 1.25, 1.5)·coercivity, relayₖ = ramp(i ∓ cₖ, sₖ) after ∓(cₖ + sₖ) (Preisach: a closed core). Without spread, a core with a gap: y = i − w·Σₖ stop(i, ±cₖ) (Prandtl–Ishlinskii); with beta, one whose loops are round and do not close: y = i − remanence·z, dz/di = (1 − abs(z)·(beta·sgn(z·di) + 1 − beta))/c, c = coercivity·(2·beta − 1)/ln(2·beta) (Bouc–Wen)";
 
 const fn card(equation: &'static str, parameters: &'static [Parameter]) -> Card {
     Card {
@@ -116,6 +112,10 @@ impl Effect for CoreHysteresis {
         self.beginning().map(|_| 2.0)
     }
 
+    fn remembers(&self) -> bool {
+        matches!(self.form, Form::Dragged | Form::Added)
+    }
+
     fn beginning(&self) -> Option<usize> {
         self.card.parameters.iter().position(|p| p.internal)
     }
@@ -132,17 +132,25 @@ impl Effect for CoreHysteresis {
     /// A closed core's relays are of every size: one spread and one middle are a rough picture of them.
     fn idealised(&self) -> f64 {
         match self.form {
-            Form::Gapped => IDEALISED,
-            _ => 2.0 * IDEALISED,
+            Form::Closed => 2.0 * IDEALISED,
+            _ => IDEALISED,
         }
     }
 
-    /// Seen as a curve of the current, a magnetisation is a bend into saturation.
+    /// Of a magnetisation the curve is as rough a picture as the memory is.
     fn curve(&self) -> f64 {
         match self.form {
             Form::Gapped | Form::Closed => STRAIGHT,
-            Form::Dragged | Form::Added => BENT,
+            Form::Dragged | Form::Added => 2.0 * STRAIGHT,
         }
+    }
+
+    fn consequences(&self, values: &[f64], _problem: &Problem) -> Vec<String> {
+        let against = "The zero is off against what flowed before: a core that is compensated by too much, or another memory than that of a core.";
+        (values[0] < 0.0)
+            .then(|| against.to_owned())
+            .into_iter()
+            .collect()
     }
 
     fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64) {
