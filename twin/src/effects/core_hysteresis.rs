@@ -3,7 +3,7 @@
 use plant::magnetic_core::{MagneticCore, MagneticCoreConfig, MagneticCoreState};
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, IDEALISED, Parameter, STRAIGHT, Search, Stage, spaced};
+use super::{Card, Clues, Effect, IDEALISED, Parameter, STRAIGHT, Search, Stage, sensing, spaced};
 use crate::problem::Problem;
 
 /// A core with an air gap, a closed one, or one that adds its magnetisation: one id, and as many parameters as each needs.
@@ -118,6 +118,12 @@ impl Effect for CoreHysteresis {
 
     fn beginning(&self) -> Option<usize> {
         self.card.parameters.iter().position(|p| p.internal)
+    }
+
+    /// Of loops without time there are a few, and signs of their blocks are no placebos for shapes as free as the last two.
+    fn applies(&self, problem: &Problem) -> bool {
+        let free = matches!(self.form, Form::Dragged | Form::Added);
+        sensing(problem) && !(free && problem.quasi_static())
     }
 
     /// The sign that a relay keeps changes at once, where a turn of the current just reaches it.
