@@ -41,7 +41,7 @@ use crate::problem::{Problem, View};
 use scene::{Scale, Scene};
 
 /// Every effect, in the order of the documentation's table.
-pub static LIBRARY: [&dyn Effect; 35] = [
+pub static LIBRARY: [&dyn Effect; 37] = [
     &offset::Offset,
     &gain::Gain,
     &offset_temperature::OffsetTemperature,
@@ -49,6 +49,8 @@ pub static LIBRARY: [&dyn Effect; 35] = [
     &supply_ratiometric::SupplyRatiometric,
     &core_hysteresis::GAPPED,
     &core_hysteresis::CLOSED,
+    &core_hysteresis::DRAGGED,
+    &core_hysteresis::ADDED,
     &core_saturation::CoreSaturation,
     &clipping::Clipping,
     &lag::Lag,
@@ -333,6 +335,16 @@ pub trait Effect: Sync {
         None
     }
 
+    /// Whether it is a curve of the present current with a memory, and named for the memory.
+    fn remembers(&self) -> bool {
+        false
+    }
+
+    /// The parameter that says how a recording begins, if there is one: its first rows tell it and no others.
+    fn beginning(&self) -> Option<usize> {
+        None
+    }
+
     /// What follows from the values, in plain words.
     fn consequences(&self, _values: &[f64], _problem: &Problem) -> Vec<String> {
         Vec::new()
@@ -430,7 +442,7 @@ mod tests {
             ("supply-ratiometric", &["ratio"]),
             (
                 "core-hysteresis",
-                &["remanence_a", "coercivity_a", "spread"],
+                &["remanence_a", "coercivity_a", "spread", "scatter"],
             ),
             ("core-saturation", &["knee_a", "softness"]),
             ("clipping", &["high_a", "low_a"]),

@@ -435,6 +435,10 @@ fn folds(bench: &Workbench<'_>, fit: &Fit) -> Held {
     let mut residual = vec![f64::NAN; bench.len()];
     let mut seen = residual.clone();
     let folds = FOLDS.min(bench.blocks.len());
+    // How the recording began is no physics that another part of it could tell.
+    let mut begun = fit.model.clone();
+    let mut members = begun.members.iter().enumerate();
+    begun.held = members.find_map(|(m, member)| Some((m, member.effect.beginning()?)));
     for fold in 0..folds {
         let mut used = vec![0.0; bench.len()];
         for (block, rows) in bench.blocks.iter().enumerate() {
@@ -442,7 +446,7 @@ fn folds(bench: &Workbench<'_>, fit: &Fit) -> Held {
                 used[rows.clone()].fill(1.0);
             }
         }
-        let other = fit::fit(bench, &fit.model, Some(&used));
+        let other = fit::fit(bench, &begun, Some(&used));
         let as_read = bench.as_read(&other.residual);
         for (block, rows) in bench.blocks.iter().enumerate() {
             if block % folds == fold {

@@ -432,6 +432,129 @@ fn a_closed_core_is_hysteresis() {
     assert_eq!(ids, ["core-hysteresis"], "{:?}", report.decisions);
 }
 
+/// Asserts that hysteresis alone is named, with these values.
+#[track_caller]
+fn assert_hysteresis(truth: &Truth, reading: Vec<f64>, seed: u64, values: &[(&str, f64, f64)]) {
+    let report = explained(truth, reading, seed, &[]);
+    let ids: Vec<&str> = report.effects.iter().map(|e| e.id.as_str()).collect();
+    assert_eq!(ids, ["core-hysteresis"], "{:?}", report.decisions);
+    assert!(
+        report.effects[0].equivalent_to.is_empty(),
+        "{:?}",
+        report.effects
+    );
+    assert_named(&report, "core-hysteresis", values);
+}
+
+/// One relay: what is added has the sign of the last current that was large enough, from before the recording on.
+#[test]
+fn a_single_relay_is_hysteresis() {
+    let truth = truth();
+    for (seed, begins) in [(31, 0.0), (32, -1.0)] {
+        let mut kept = begins;
+        let reading = truth.current_a.iter().map(|i| {
+            if i.abs() > 30.0 {
+                kept = i.signum();
+            }
+            i + 1.5 * kept
+        });
+        assert_hysteresis(
+            &truth,
+            reading.collect(),
+            seed,
+            &[("remanence_a", 1.5, 0.1), ("coercivity_a", 30.0, 3.0)],
+        );
+    }
+}
+
+/// A plane of relays with a Lorentzian density of coercivities and of the fields of neighbours, each relay by itself.
+#[test]
+fn a_preisach_plane_is_hysteresis() {
+    let truth = truth();
+    let (coercivity_a, remanence_a) = (30.0, 2.0);
+    let bell = |x: f64| 1.0 / (1.0 + x * x);
+    let mut relays = Vec::new();
+    for c in 1..=40 {
+        for b in -40..=40 {
+            let (c, b) = (0.1 * f64::from(c), 0.1 * f64::from(b));
+            let density = bell((c - 1.0) / 0.4) * bell(b / 0.5);
+            relays.push(((b + c) * coercivity_a, (b - c) * coercivity_a, density));
+        }
+    }
+    // From saturation on one side: the rest of it, what is above and what is below, is the remanence's unit.
+    let left: f64 = relays
+        .iter()
+        .map(|(_, down, w)| if *down < 0.0 { *w } else { -w })
+        .sum();
+    let mut states: Vec<f64> = relays
+        .iter()
+        .map(|(up, down, _)| -(up + down).signum())
+        .collect();
+    let reading = truth.current_a.iter().map(|i| {
+        let mut sum = 0.0;
+        for ((up, down, density), state) in relays.iter().zip(&mut states) {
+            if i >= up {
+                *state = 1.0;
+            } else if i <= down {
+                *state = -1.0;
+            }
+            sum += density * *state;
+        }
+        i + remanence_a * sum / left
+    });
+    assert_hysteresis(
+        &truth,
+        reading.collect(),
+        33,
+        &[("remanence_a", 2.0, 0.2), ("coercivity_a", 30.0, 3.0)],
+    );
+}
+
+/// Bouc and Wen's equation with an exponent of two, by small steps; on either side of the current.
+#[test]
+fn rounded_loops_that_do_not_close_are_hysteresis() {
+    let truth = truth();
+    for (seed, remanence_a) in [(34, 2.0), (35, -2.0)] {
+        let (mut z, mut at) = (0.0f64, 0.0);
+        let reading = truth.current_a.iter().map(|i| {
+            let steps = ((i - at).abs() / 0.05).ceil();
+            for _ in 0..steps as usize {
+                let dz = (i - at) / steps / 25.0;
+                z += dz - 0.5 * (dz.abs() * z.abs() * z + dz * z * z);
+            }
+            at = *i;
+            i - remanence_a * z
+        });
+        assert_hysteresis(
+            &truth,
+            reading.collect(),
+            seed,
+            &[
+                ("remanence_a", remanence_a, 0.2),
+                ("coercivity_a", 25.0, 5.0),
+            ],
+        );
+    }
+}
+
+/// What is turned over once, or goes with the sign of the present current, is no memory of a core.
+#[test]
+fn a_drift_or_a_side_is_no_hysteresis() {
+    let truth = truth();
+    let drift = |row: usize| 6.0 * row as f64 / ROWS as f64 - 3.0;
+    let drifting = truth.current_a.iter().enumerate();
+    let drifting = drifting.map(|(row, i)| i + drift(row)).collect();
+    let sides = truth.current_a.iter();
+    let sides = sides
+        .map(|i| if *i > 0.0 { 1.02 * i } else { *i })
+        .collect();
+    for (seed, reading) in [(36, drifting), (37, sides)] {
+        let report = explained(&truth, reading, seed, &[]);
+        let named = |id: &str| report.effects.iter().any(|effect| effect.id == id);
+        assert!(!named("core-hysteresis"), "{:?}", report.effects);
+    }
+}
+
 /// Noise that wanders for half a minute, a little white noise beside it.
 const SLOW: Coloured = Coloured {
     rms: 0.48,

@@ -141,6 +141,8 @@ fn a_core_and_its_heat_go_on_over_a_gap() {
     for (id, values) in [
         ("core-hysteresis", vec![0.1, 1.0]),
         ("core-hysteresis", vec![0.1, 1.0, 1.0]),
+        ("core-hysteresis", vec![0.1, 1.0, 0.7, 0.2]),
+        ("core-hysteresis", vec![0.1, 1.0, 1.5, 0.4, 0.3]),
         ("sensor-self-heating", vec![1e-3, 30.0]),
     ] {
         assert_goes_on(View::Sensor, &sensor, id, &values);

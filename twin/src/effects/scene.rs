@@ -14,11 +14,16 @@ pub const ZERO_CELSIUS_K: f64 = 273.15;
 /// Kinds of step that are remembered while steps are told apart.
 const KNOWN: usize = 16;
 
+/// What turns over fewer times than this in a recording is not told from a zero that drifts or jumps.
+pub const ROUNDS: usize = 4;
+
 /// What sizes are natural in a problem: bounds and starts follow from it.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Scale {
     /// Largest abs(reference).
     pub largest: f64,
+    /// The largest size that the reference passes on one side and on the other in turn, at least [`ROUNDS`] times; 0 without.
+    pub both_ways: f64,
     /// Root mean square of the reference.
     pub rms: f64,
     /// Full scale of the sensor: as stated, else the largest reading.

@@ -297,14 +297,15 @@ fn may_join(model: &Model, effect: &'static dyn Effect) -> bool {
             .iter()
             .filter(|other| other.card().id == card.id)
             .all(|other| other.card().parameters.len() >= branches),
-        // One branch more at a time.
+        // One branch more at a time; another form at once.
         Some(member) => {
             let now = member.values.len();
             branches > now
-                && !crate::effects::LIBRARY.iter().any(|other| {
-                    let size = other.card().parameters.len();
-                    other.card().id == card.id && size > now && size < branches
-                })
+                && (effect.alternative()
+                    || !crate::effects::LIBRARY.iter().any(|other| {
+                        let size = other.card().parameters.len();
+                        other.card().id == card.id && size > now && size < branches
+                    }))
         }
     }
 }

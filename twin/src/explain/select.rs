@@ -4,6 +4,7 @@ use rayon::prelude::*;
 
 use super::fit::{Fit, change, dot, fit, held_out, huber, loss, polish};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
+use super::shape::without_memory;
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search, Stage, find};
 
@@ -558,6 +559,13 @@ fn small(
     let there = 1.0 - to / f64::max(from, 1e-300);
     if cut(&after.model, index) && chance(&before.residual, &after.residual) {
         return Some("shown only by readings that noise takes over the other's threshold".into());
+    }
+    if member.effect.remembers() {
+        let error = bench.as_read(&after.residual);
+        let (without, with) = without_memory(bench, &error, &as_read);
+        if chance(&without, &with) {
+            return Some("what it remembers shows no more than by chance beside a curve".into());
+        }
     }
     let (gain, there) = if bench.is_white() || cut(&after.model, index) {
         size_beside(bench, &before.residual, &after.model, index)

@@ -69,6 +69,23 @@ fn clean(columns: &mut [Vec<f64>], others: &[Vec<f64>]) {
     }
 }
 
+/// A residual without and with what an effect remembers: its change beside a curve of the present current. Both beside such a curve
+/// of the recording's own.
+pub fn without_memory(
+    bench: &Workbench<'_>,
+    residual: &[f64],
+    change: &[f64],
+) -> (Vec<f64>, Vec<f64>) {
+    let mut both = [change.to_vec(), residual.to_vec()];
+    let hats = hats(bench);
+    if !hats.is_empty() {
+        clean(&mut both, &hats);
+    }
+    let [memory, with] = both;
+    let without = with.iter().zip(&memory).map(|(r, m)| r + m).collect();
+    (without, with)
+}
+
 /// Energy of a series that columns hold.
 fn held(columns: &[Vec<f64>], series: &[f64]) -> f64 {
     let ones = vec![1.0; series.len()];

@@ -11,9 +11,9 @@ use rand_distr::{Distribution as _, StandardNormal};
 
 use super::whiten::Whitening;
 use crate::effects::chain::{Begun, Chain, Change, Nuisance, Variation};
-use crate::effects::scene::Scale;
+use crate::effects::scene::{ROUNDS, Scale};
 use crate::effects::{Clues, Effect, LIBRARY, Parameter, Stage, find_with};
-use crate::problem::{Base, Coloured, Problem, View};
+use crate::problem::{Base, Coloured, Drive, Problem, View};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row).
 const MOST_ROWS: usize = 250_000;
@@ -537,6 +537,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         .fold(0.0, f64::max);
     let mut scale = Scale {
         largest,
+        both_ways: both_ways(drive, largest),
         rms: rms(drive.reference.iter().copied()),
         full_scale: largest.max(y.iter().fold(0.0f64, |most, value| most.max(value.abs()))),
         mismatch: rms(y.iter().zip(plain).map(|(y, p)| y - p)),
@@ -571,6 +572,37 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         }
     }
     scale
+}
+
+/// See [`Scale::both_ways`]: the count falls with the size, so it is found by halves.
+fn both_ways(drive: &Drive, largest: f64) -> f64 {
+    let rounds = |size: f64| -> usize {
+        let of_one = |rows: Range<usize>| {
+            let mut side = 0.0;
+            let mut rounds = 0;
+            for value in drive.reference[rows].iter().filter(|x| x.abs() > size) {
+                if side != 0.0 && value.signum() != side {
+                    rounds += 1;
+                }
+                side = value.signum();
+            }
+            rounds
+        };
+        drive.operations().into_iter().map(of_one).sum()
+    };
+    let (mut low, mut high) = (0.0, largest);
+    if rounds(low) < ROUNDS {
+        return 0.0;
+    }
+    for _ in 0..16 {
+        let middle = 0.5 * (low + high);
+        if rounds(middle) < ROUNDS {
+            high = middle;
+        } else {
+            low = middle;
+        }
+    }
+    low
 }
 
 /// Blocks of equal numbers of rows.
