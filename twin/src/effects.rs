@@ -194,6 +194,13 @@ pub enum Stage {
     BatteryVoltage,
 }
 
+impl Stage {
+    /// Whether effects of it work on what is between the rows.
+    pub fn is_between_rows(self) -> bool {
+        matches!(self, Self::Clock | Self::Filter | Self::Converter)
+    }
+}
+
 /// What is said of an effect: the row of the effects table.
 #[derive(Debug)]
 pub struct Card {

@@ -24,7 +24,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use crate::effects::chain::{Chain, Nuisance};
-use crate::effects::{Effect, Stage, find_with};
+use crate::effects::{Effect, find_with};
 use crate::problem::Problem;
 use crate::report::data::{Report, SignalReport, Unexplained, Verdict};
 use fit::Fit;
@@ -342,11 +342,10 @@ impl Decided {
 
     /// Whether it turns on what the reference does between its rows.
     fn asks_between(&self) -> bool {
-        let works_between = |member: &workbench::Member| {
-            let stage = member.effect.card().stage;
-            matches!(stage, Stage::Clock | Stage::Filter | Stage::Converter)
-        };
-        self.selection.fit.model.members.iter().any(works_between)
+        let members = &self.selection.fit.model.members;
+        members
+            .iter()
+            .any(|member| member.effect.card().stage.is_between_rows())
             || self.verdict == Verdict::Unknown
     }
 

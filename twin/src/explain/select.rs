@@ -1093,14 +1093,25 @@ fn name(
             // Where few rows decide, the difference of two models is never certain: who takes much less is no equal.
             let least = (EQUAL * taken).max(p99_of(step_p99, id));
             let beside = beside(bench, now, index);
+            let between = |member: &Member| member.effect.card().stage.is_between_rows();
+            let stamped = if between(&now.model.members[index]) {
+                bench.stamped()
+            } else {
+                0.0
+            };
             let mut equivalent: Vec<&'static str> = others
                 .iter()
                 .filter(|(at, _)| *at == index)
                 .filter(|(_, other)| {
                     let last = other.model.members.len() - 1;
+                    let as_good = if between(&other.model.members[last]) {
+                        beside + stamped
+                    } else {
+                        beside
+                    };
                     share(bench, &without, other) >= least
                         // What the other effects' equations may be off by does not decide between two.
-                        && (apart(bench, &now.predicted, &other.predicted) < beside || !beaten(bench, other, now))
+                        && (apart(bench, &now.predicted, &other.predicted) < as_good || !beaten(bench, other, now))
                         // At the end of what is physics it cannot be named, and speaks against another's being certain.
                         && small(bench, &without, other, last, 1.0).is_none()
                 })

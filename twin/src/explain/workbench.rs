@@ -23,6 +23,10 @@ const BLOCKS: usize = 24;
 const LEAST_ROWS: usize = 6;
 /// Share of a block that is left out at its end, so that neighbours do not tell each other's noise.
 const GUARD: f64 = 0.08;
+/// What is below the mean by more than a standard deviation, as a share of a normal distribution.
+const SIXTH: f64 = 0.1587;
+/// Steps whose standard deviation is a larger share of them are no even ones with a jitter.
+const JITTER: f64 = 0.3;
 
 /// An effect with values.
 #[derive(Clone)]
@@ -305,6 +309,20 @@ impl<'a> Workbench<'a> {
         }
     }
 
+    /// Energy by which stamps that should be even move readings and reference against each other. Effects that work between the rows are
+    /// not told apart by less: a window of a few rows evens that out, whatever the sensor does.
+    pub fn stamped(&self) -> f64 {
+        let drive = &self.problem.drive;
+        let jitter_s = unevenness(&self.t_s).hypot(if self.problem.observed.on_drive_rows {
+            0.0
+        } else {
+            unevenness(&drive.t_s) * drive.stride() as f64
+        });
+        (0..self.len())
+            .map(|row| (jitter_s * self.slope_per_s(row)).powi(2))
+            .sum()
+    }
+
     /// True without any.
     pub fn is_empty(&self) -> bool {
         self.rows.is_empty()
@@ -496,6 +514,24 @@ fn nearest(problem: &Problem, rows: &[usize]) -> Vec<f64> {
                 .unwrap_or_default()
         })
         .collect()
+}
+
+/// Standard deviation of one stamp of a series that is sent at even times, in s: each step has two. 0 where steps differ by more than
+/// a jitter.
+fn unevenness(t_s: &[f64]) -> f64 {
+    let mut steps: Vec<f64> = t_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    if steps.len() < 20 {
+        return 0.0;
+    }
+    steps.sort_unstable_by(f64::total_cmp);
+    // A sixth to either side of the middle is beyond one standard deviation; gaps are no jitter.
+    let at = |share: f64| steps[(share * (steps.len() - 1) as f64) as usize];
+    let deviation = 0.5 * (at(1.0 - SIXTH) - at(SIXTH));
+    if deviation < JITTER * at(0.5) {
+        deviation / std::f64::consts::SQRT_2
+    } else {
+        0.0
+    }
 }
 
 fn rms(values: impl Iterator<Item = f64>) -> f64 {
