@@ -130,7 +130,7 @@ impl Merged {
 
     /// With times from the start of the measurement: where they do not count from there, from the first row.
     #[must_use]
-    pub(crate) fn from_its_start(mut self) -> Self {
+    pub(crate) fn counted_from_its_start(mut self) -> Self {
         let first_s = self.time_s.first().copied().unwrap_or_default();
         if !(0.0..DAY_S).contains(&first_s) {
             self.time_s.iter_mut().for_each(|time_s| *time_s -= first_s);
@@ -300,7 +300,7 @@ mod tests {
                 time_s: recorded.to_vec(),
                 signals: vec![signal],
             };
-            let merged = Merged::new("m.mf4", vec![series]).map(Merged::from_its_start);
+            let merged = Merged::new("m.mf4", vec![series]).map(Merged::counted_from_its_start);
             assert_eq!(merged.map(|merged| merged.time_s), Ok(expected.to_vec()));
         }
     }

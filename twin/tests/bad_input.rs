@@ -874,6 +874,8 @@ fn ranges_without_a_flag_are_said() {
     );
 }
 
+type Course<'a> = &'a dyn Fn(f64) -> f64;
+
 #[test]
 fn a_reference_that_stands_is_not_at_fault() {
     // The car stands for half a minute; a dead sensor reads its noise; the sensor comes to rest slowly.
@@ -888,7 +890,7 @@ fn a_reference_that_stands_is_not_at_fault() {
         }
     };
     let slowly = |t: f64| current(t.min(10.0)) * (1.0 - 0.03 * (t - 10.0).max(0.0)).max(0.0);
-    let cases: [(&dyn Fn(f64) -> f64, &dyn Fn(f64) -> f64); 3] = [
+    let cases: [(Course<'_>, Course<'_>); 3] = [
         (&stands(0.0), &noise),
         (&stands(2.0), &noise),
         (&stands(0.0), &slowly),
