@@ -522,7 +522,7 @@ pub(super) fn plausible(
     let together = correlation(beside(drive, observed, &wild.rows));
     if together.abs() < UNRELATED {
         remarks.push(format!(
-            "{measured} does not follow {reference} (correlation {together:.2}): the reference may be that of another conductor"
+            "{measured} does not follow {reference} (correlation {together:.2}): the sensor may be dead, or the reference be that of another conductor"
         ));
     }
     let spread_x = spread(beside(drive, observed, &wild.rows).map(|(reference, _)| reference));
