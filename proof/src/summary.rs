@@ -1032,7 +1032,7 @@ fn targets(summary: &Summary) -> Vec<Target> {
         ));
     }
     targets.push(share(
-        "confidently wrong with the true effect taken out, (d)",
+        "confidently wrong with the true effect taken out, (c) and (d)",
         "≤ 5 %",
         &summary.without.confidently_wrong,
         summary.without.confidently_wrong.value() <= 0.05,

@@ -218,7 +218,8 @@ fn from_mdf(source: &str, bytes: &[u8], options: &Options) -> Result<Converted> 
         series.extend(decoded_series);
         counts = Some((contents.counts, decoded));
     }
-    let merged = Merged::new(source, series)?.leaving_out(contents.left_out.clone());
+    let merged = Merged::new(source, series)?.counted_from_its_start();
+    let merged = merged.leaving_out(contents.left_out.clone());
     let mut left_out = contents.left_out;
     left_out.extend(replaced(&options.mapping, &merged));
     Ok(Converted {

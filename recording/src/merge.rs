@@ -12,6 +12,9 @@ use crate::{
     unit,
 };
 
+/// A first row that is so long after the start of its measurement, or before it, counts from elsewhere.
+const DAY_S: f64 = 86_400.0;
+
 /// Signals with the same time stamps: those of one message, or of one group of channels.
 #[derive(Clone, Debug, Default)]
 pub struct Series {
@@ -123,6 +126,16 @@ impl Merged {
             columns,
             left_out: Vec::new(),
         })
+    }
+
+    /// With times from the start of the measurement: where they do not count from there, from the first row.
+    #[must_use]
+    pub(crate) fn counted_from_its_start(mut self) -> Self {
+        let first_s = self.time_s.first().copied().unwrap_or_default();
+        if !(0.0..DAY_S).contains(&first_s) {
+            self.time_s.iter_mut().for_each(|time_s| *time_s -= first_s);
+        }
+        self
     }
 
     /// With what else the file has, each as `name (reason)`: said if it is asked for.
@@ -264,4 +277,31 @@ fn repeats(time_s: &[f64]) -> impl Iterator<Item = (f64, u32)> {
         // Not two zeros.
         (time_s + 0.0, count)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_that_do_not_count_from_the_measurement_count_from_the_first_row() {
+        for (recorded, expected) in [
+            ([0.25, 1.25], [0.25, 1.25]),
+            ([-95_385_945.5, -95_385_944.5], [0.0, 1.0]),
+            ([1.7e9, 1.7e9 + 1.0], [0.0, 1.0]),
+        ] {
+            let signal = Signal {
+                name: "x".to_owned(),
+                bare: "x".to_owned(),
+                unit: None,
+                values: vec![1.0, 2.0],
+            };
+            let series = Series {
+                time_s: recorded.to_vec(),
+                signals: vec![signal],
+            };
+            let merged = Merged::new("m.mf4", vec![series]).map(Merged::counted_from_its_start);
+            assert_eq!(merged.map(|merged| merged.time_s), Ok(expected.to_vec()));
+        }
+    }
 }

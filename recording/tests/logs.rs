@@ -74,6 +74,19 @@ fn candump_lines() {
 }
 
 #[test]
+fn a_candump_log_that_is_cut_loses_its_last_line() {
+    let log = "(1.0) can0 123#0102\n(1.1) can0 123#0304";
+    // Wherever it was cut, of the second frame nothing is made up.
+    for length in "(1.0) can0 123#0102\n(".len()..=log.len() {
+        let (frames, counts) = read(CANDUMP, &log.as_bytes()[..length]).unwrap();
+        assert_eq!(frames, [plain(1_000_000_000, "can0", 0x123, &[1, 2])]);
+        assert_eq!((counts.frames, counts.cut), (1, 1));
+    }
+    let (frames, counts) = read(CANDUMP, format!("{log}\n").as_bytes()).unwrap();
+    assert_eq!((frames.len(), counts.cut), (2, 0));
+}
+
+#[test]
 fn candump_faults_have_their_place() {
     let cases = [
         (
@@ -123,7 +136,9 @@ fn candump_faults_have_their_place() {
     ];
     for (log, sentence) in cases {
         assert_eq!(
-            read(CANDUMP, log.as_bytes()).unwrap_err().to_string(),
+            read(CANDUMP, format!("{log}\n").as_bytes())
+                .unwrap_err()
+                .to_string(),
             sentence
         );
     }

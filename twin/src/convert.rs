@@ -89,6 +89,7 @@ fn summary(arguments: &Arguments, converted: &Converted) -> String {
             (counts.remote, "remote frames"),
             (counts.errors, "error frames"),
             (counts.others, "other events"),
+            (counts.cut, "left out: the log ends within its last line"),
         ];
         for (count, what) in rest {
             if count > 0 {

@@ -94,6 +94,16 @@ pub enum Search {
     Stepped,
 }
 
+impl Search {
+    /// What is searched over orders of magnitude, or in steps, is a size: it has no sign.
+    const fn limits(self) -> (f64, f64) {
+        match self {
+            Self::Linear | Self::Smooth => (f64::NEG_INFINITY, f64::INFINITY),
+            Self::Logarithmic | Self::Stepped => (0.0, f64::INFINITY),
+        }
+    }
+}
+
 /// A parameter of an effect.
 #[derive(Clone, Copy, Debug)]
 pub struct Parameter {
@@ -103,6 +113,8 @@ pub struct Parameter {
     pub unit: &'static str,
     /// Value that switches the effect off.
     pub off: f64,
+    /// Lowest and highest value that mean anything, whatever the recording: a model file may hold no other.
+    pub limits: (f64, f64),
     /// How it is searched for.
     pub search: Search,
     /// Needed to run the model, and no property of the physics (a phase): it is not reported.
@@ -121,6 +133,7 @@ impl Parameter {
             name,
             unit,
             off,
+            limits: search.limits(),
             search,
             internal: false,
             open: false,
@@ -144,11 +157,17 @@ impl Parameter {
         self
     }
 
+    const fn within(mut self, lowest: f64, highest: f64) -> Self {
+        self.limits = (lowest, highest);
+        self
+    }
+
     const fn internal(name: &'static str, unit: &'static str, off: f64, search: Search) -> Self {
         Self {
             name,
             unit,
             off,
+            limits: (f64::NEG_INFINITY, f64::INFINITY),
             search,
             internal: true,
             open: false,
@@ -254,6 +273,11 @@ pub trait Effect: Sync {
 
     /// Points from which it is searched: values for every parameter, those of [`Search::Linear`] at a small step from off.
     fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>>;
+
+    /// What values that are each within their limits have to be beside one another, if these are not.
+    fn at_odds(&self, _values: &[f64]) -> Option<&'static str> {
+        None
+    }
 
     /// Changes the scene.
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>);

@@ -12,13 +12,16 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use recording::csv;
+use recording::{csv, name};
 use serde::Deserialize;
 
 pub use extended::{Found, Shift};
 use place::Places;
 
-use crate::{effects::Parameter, failure::Failure};
+use crate::{
+    effects::{self, Parameter},
+    failure::Failure,
+};
 
 /// Version of the format.
 pub const SCHEMA: u32 = 1;
@@ -270,11 +273,40 @@ impl Model {
                 "at least one of them",
             ));
         }
+        let stated = [
+            parsed.sensor.as_ref().and_then(|it| it.reference.as_ref()),
+            parsed.sensor.as_ref().and_then(|it| it.measured.as_ref()),
+            parsed.charge.as_ref().and_then(|it| it.column.as_ref()),
+            battery.as_ref().and_then(|it| it.current.as_ref()),
+        ];
+        for name in parsed.columns.keys() {
+            if name::meaning(name).is_none() && !stated.contains(&Some(name)) {
+                let known = name::CANONICAL.map(|known| known.name).join(", ");
+                return Err(places.fault(
+                    &["columns", name],
+                    "a name that nothing here goes by",
+                    &format!("one of {known}, or a column that this file states"),
+                ));
+            }
+        }
         let mut effects = Vec::new();
         // In the order of the file: a gain after an offset is not an offset after a gain.
         for id in places.order("effects") {
             if let Some(values) = parsed.effects.get(&id) {
-                effects.push(modelled(&id, values, &places)?);
+                let (id, values) = modelled(&id, values, &places)?;
+                let (beside, is_there) = if registry::of_battery(id) {
+                    ("[battery]", battery.is_some())
+                } else {
+                    ("[sensor]", parsed.sensor.is_some())
+                };
+                if !is_there {
+                    return Err(places.fault(
+                        &["effects", id],
+                        &format!("an effect of what no {beside} describes"),
+                        &format!("{beside} beside it"),
+                    ));
+                }
+                effects.push((id, values));
             }
         }
         Ok(Self {
@@ -619,7 +651,25 @@ fn modelled(
                 "a finite number",
             ));
         }
+        let (lowest, highest) = parameter.limits;
+        if value < lowest || value > highest {
+            let expected = match parameter.limits {
+                (0.0, f64::INFINITY) => "a number, zero or more".to_owned(),
+                (_, f64::INFINITY) => "a number above 0".to_owned(),
+                _ => format!("a number from {lowest} to {highest}"),
+            };
+            return Err(places.fault(
+                &["effects", id, parameter.name],
+                &value.to_string(),
+                &expected,
+            ));
+        }
         ordered.push(value);
+    }
+    let effect = effects::find_with(id, ordered.len());
+    if let Some(expected) = effect.and_then(|effect| effect.at_odds(&ordered)) {
+        let values: Vec<String> = ordered.iter().map(f64::to_string).collect();
+        return Err(places.fault(&["effects", id], &values.join(" and "), expected));
     }
     Ok((id, ordered))
 }

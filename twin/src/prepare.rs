@@ -143,6 +143,10 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
     };
     for frame in [Some(&frame), reference.as_ref()].into_iter().flatten() {
         checks::time_goes_on(frame)?;
+        checks::surroundings(frame)?;
+        if let Some(remark) = checks::milliseconds(frame)? {
+            work.remark(remark);
+        }
         let left_out = frame.left_out();
         if !left_out.is_empty() {
             work.remark(format!(
@@ -166,7 +170,7 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
         work.not_compared(&items);
     }
     for item in &mut items {
-        model_effects(model, item);
+        model_effects(model, item)?;
         if purpose == Purpose::Compare {
             checks::enough(&item.problem, frame.source())?;
         }
@@ -276,6 +280,16 @@ impl<'a> Work<'a> {
             checks::some_values(value, &measured, self.frame.source())?;
             checks::not_constant(value, &measured, self.frame.source())?;
             checks::not_constant(found, &reference, self.drive_frame().source())?;
+        }
+        if sensor.range_limit.is_some()
+            && !self.frame.has("range_high")
+            && !self.drive_frame().has("range_high")
+        {
+            self.remark(format!(
+                "range_limit is stated and {} has no column range_high: range-mismatch and range-handover, which go by it, are not \
+                 looked for",
+                self.frame.source()
+            ));
         }
         let board = Board::new(sensor.front_end, sensor.average.unwrap_or(1));
         let fresh = match &value {
@@ -622,7 +636,7 @@ impl<'a> Work<'a> {
 }
 
 /// Puts the effects of the model file into a problem, those that act in its view.
-fn model_effects(model: &Model, item: &mut Item) {
+fn model_effects(model: &Model, item: &mut Item) -> Result<(), Failure> {
     let problem = &mut item.problem;
     let battery = matches!(problem.view, View::StateOfCharge | View::Voltage);
     problem.modelled = model
@@ -632,14 +646,15 @@ fn model_effects(model: &Model, item: &mut Item) {
         .cloned()
         .collect();
     if problem.modelled.is_empty() {
-        return;
+        return Ok(());
     }
+    checks::moments(model, problem)?;
     let changed = modelled_change(problem);
     let Base::Sensor(base) = &mut problem.base else {
-        return;
+        return Ok(());
     };
     if base.reading.is_empty() {
-        return;
+        return Ok(());
     }
     // Between two conversions the board holds its reading, with what the effects made of it.
     let mut held = 0.0;
@@ -649,6 +664,7 @@ fn model_effects(model: &Model, item: &mut Item) {
         }
         *reading += held;
     }
+    Ok(())
 }
 
 /// What the effects of the model file change of an ideal sensor's reading, at each observed row.

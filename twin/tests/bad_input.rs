@@ -722,3 +722,209 @@ fn single_readings_that_are_wild_are_said() {
     );
     assert!(!remarks.contains("another conductor"), "{remarks}");
 }
+
+const COUNTED: &str = "schema = 1\n[sensor]\nnoise = 0.1\n[charge]\n";
+
+/// A sensor with a counter that shows `factor` times the charge, set anew in the middle.
+fn counted(factor: f64) -> String {
+    // What current() comes to since 0 s.
+    let charge = |t: f64| {
+        let swings = |t: f64| -10.0 / 0.37 * (0.37 * t).cos() - 3.0 / 1.91 * (1.91 * t).cos() + t;
+        swings(t) - swings(if t < 60.0 { 0.0 } else { 60.0 })
+    };
+    "t_s,i_ref_a,i_meas_a,q_meas_c\n".to_owned()
+        + &rows(1200, |t| {
+            let noise = 0.1 * (77.7 * t).sin();
+            format!(
+                "{t},{},{},{}",
+                current(t),
+                current(t) + noise,
+                factor * charge(t)
+            )
+        })
+}
+
+#[test]
+fn a_charge_in_another_unit_or_sign() {
+    for (factor, unit) in [(1.0 / 3600.0, "in Ah"), (1e3, "in thousandths of C")] {
+        says(
+            &explained(COUNTED, &counted(factor)),
+            &["r.csv, column q_meas_c: found", "expected C", unit],
+        );
+    }
+    says(
+        &explained(COUNTED, &counted(-1.0)),
+        &[
+            "q_meas_c falls where",
+            "opposite signs",
+            "--map q_meas_c=-q_meas_c",
+        ],
+    );
+    // A counter that is wrong is one all the same.
+    for factor in [1.0, 2.0] {
+        let said = report(&[("m.toml", COUNTED), ("r.csv", &counted(factor))], &[]);
+        assert!(said["remarks"].to_string().contains("set anew 1 times"));
+    }
+}
+
+#[test]
+fn surroundings_in_another_unit() {
+    for (name, value, expected) in [
+        (
+            "temp_sensor_c",
+            297.0,
+            "°C, -60 … 200 (it may be in kelvin)",
+        ),
+        ("temp_cell_c", 297.0, "kelvin"),
+        ("v_supply_v", 5000.0, "V, 0 … 100 (it may be in mV)"),
+    ] {
+        let recording = format!("t_s,i_ref_a,i_meas_a,{name}\n")
+            + &rows(300, |t| {
+                format!("{t},{},{},{}", current(t), current(t) + 0.5, value + t)
+            });
+        says(
+            &explained(PAIR, &recording),
+            &[&format!("r.csv, column {name}: found {value} … "), expected],
+        );
+        // A row that can be makes the others faults of single rows.
+        let once = recording.replacen(&format!(",{value}\n"), ",20\n", 1);
+        report(&[("m.toml", PAIR), ("r.csv", &once)], &[]);
+    }
+}
+
+#[test]
+fn a_time_in_ms() {
+    let with = |from: f64, step: f64| {
+        "t_s,i_ref_a,i_meas_a\n".to_owned()
+            + &rows(300, |t| {
+                let at = from + (10.0 * t * step).round();
+                format!("{at},{},{}", current(t), current(t) + 0.5)
+            })
+    };
+    says(
+        &explained(PAIR, &with(1.7e12, 100.0)),
+        &["r.csv, column t_s: found a time of 1700000000000, expected s"],
+    );
+    let remarks = |from, step| {
+        let said = report(&[("m.toml", PAIR), ("r.csv", &with(from, step))], &[]);
+        said["remarks"].to_string()
+    };
+    says(&remarks(0.0, 100.0), &["100 s apart", "if that is in ms"]);
+    // A row a second since 1970, and a row a minute.
+    for (from, step) in [(1.7e9, 1.0), (0.0, 60.0)] {
+        assert_eq!(remarks(from, step), "[]");
+    }
+}
+
+#[test]
+fn a_current_that_no_cell_survives() {
+    let battery = |ohm: f64| {
+        format!(
+            "schema = 1\n[battery]\ncapacity_ah = 50\ninitial_soc = 0.5\nohmic_resistance_ohm = {ohm}\nocv = [[0, 3.0], [1, 4.0]]\n"
+        )
+    };
+    let recording = |factor: f64| {
+        "t_s,i_ref_a,v_cell_v\n".to_owned()
+            + &rows(300, |t| {
+                format!("{t},{},{}", factor * current(t), 3.5 - 0.0015 * current(t))
+            })
+    };
+    for (ohm, factor) in [(0.0015, 1000.0), (1.5, 1.0)] {
+        says(
+            &explained(&battery(ohm), &recording(factor)),
+            &[
+                "column i_ref_a: found currents up to",
+                "ohmic_resistance_ohm",
+                "more than the open-circuit voltage",
+            ],
+        );
+    }
+    report(
+        &[("m.toml", &battery(0.0015)), ("r.csv", &recording(1.0))],
+        &[],
+    );
+}
+
+#[test]
+fn a_reading_that_is_scaled_is_said() {
+    let remarks = |factor: f64| {
+        let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+            + &rows(300, |t| {
+                format!("{t},{},{}", current(t), factor * current(t) + 0.5)
+            });
+        report(&[("m.toml", PAIR), ("r.csv", &recording)], &[])["remarks"].to_string()
+    };
+    says(
+        &remarks(100.0),
+        &["a factor of 100", "may be scaled, or in another unit"],
+    );
+    assert_eq!(remarks(2.0), "[]");
+}
+
+#[test]
+fn ranges_without_a_flag_are_said() {
+    let model = "schema = 1\n[sensor]\nrange_limit = 5\n";
+    let said = report(&[("m.toml", model), ("r.csv", &good())], &[]);
+    says(
+        &said["remarks"].to_string(),
+        &[
+            "r.csv has no column range_high",
+            "range-mismatch and range-handover",
+        ],
+    );
+}
+
+type Course<'a> = &'a dyn Fn(f64) -> f64;
+
+#[test]
+fn a_reference_that_stands_is_not_at_fault() {
+    // The car stands for half a minute; a dead sensor reads its noise; the sensor comes to rest slowly.
+    let noise = |t: f64| ((12.9898 * t).sin() * 43_758.547).fract();
+    let stands = |at: f64| {
+        move |t: f64| {
+            if (10.0..40.0).contains(&t) {
+                at
+            } else {
+                current(t)
+            }
+        }
+    };
+    let slowly = |t: f64| current(t.min(10.0)) * (1.0 - 0.03 * (t - 10.0).max(0.0)).max(0.0);
+    let cases: [(Course<'_>, Course<'_>); 3] = [
+        (&stands(0.0), &noise),
+        (&stands(2.0), &noise),
+        (&stands(0.0), &slowly),
+    ];
+    for (reference, reading) in cases {
+        let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+            + &rows(600, |t| format!("{t},{},{}", reference(t), reading(t)));
+        let said = report(&[("m.toml", PAIR), ("r.csv", &recording)], &[]);
+        let remarks = said["remarks"].to_string();
+        assert!(!remarks.contains("reference may be at fault"), "{remarks}");
+    }
+}
+
+#[test]
+fn a_delay_beyond_the_recording() {
+    let model = "schema = 1\n[sensor]\n[effects.delay]\ndelay_s = 1e9\n";
+    says(
+        &explained(model, &good()),
+        &[
+            "m.toml, key effects.delay.delay_s: found 1000000000",
+            "less than the recording's 29.900 s",
+        ],
+    );
+}
+
+#[test]
+fn columns_by_other_names_are_hinted_at() {
+    let renamed = good().replacen("t_s,i_ref_a,i_meas_a", "time,current_ref,current", 1);
+    says(
+        &explained(PAIR, &renamed),
+        &[
+            "time, current_ref, current",
+            "expected a column \"t_s\"",
+            "--map NAME=COLUMN",
+        ],
+    );
+}

@@ -67,6 +67,23 @@ fn a_log_becomes_a_recording() {
 }
 
 #[test]
+fn a_log_that_is_cut_is_said_to_be() {
+    let folder = folder();
+    // Two bytes of four: the same frame, only shorter.
+    let cut = format!("{LOG}(1700000002.5) can0 010#E803");
+    fs::write(folder.path().join("cut.log"), cut).unwrap();
+    let arguments = ["convert", "cut.log", "--dbc", "v.dbc", "--out", "cut.csv"];
+    let output = twin(folder.path(), &arguments);
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    let said = text(&output.stdout);
+    assert!(said.starts_with("cut.csv: 2 rows of"), "{said}");
+    assert!(
+        said.contains("1 left out: the log ends within its last line"),
+        "{said}"
+    );
+}
+
+#[test]
 fn columns_are_mapped_and_parquet_holds_the_same() {
     let folder = folder();
     let mut arguments = vec!["convert", "drive.log", "--dbc", "v.dbc"];

@@ -244,3 +244,32 @@ fn a_power_sensor_in_its_own_words() {
     let end = interval.rsplit(' ').next().unwrap();
     assert!(end.starts_with("1.01"), "{interval}");
 }
+
+#[test]
+fn a_current_is_on_no_axis_of_volts() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let mut text = "t_s,i_ref_a,v_cell_v\n".to_owned();
+    for k in 0..600 {
+        let t_s = f64::from(k) * 0.1;
+        let current = 70.0 * (0.37 * t_s).sin() + 20.0;
+        text.push_str(&format!("{t_s},{current},{}\n", 3.5 - 0.0015 * current));
+    }
+    fs::write(folder.join("r.csv"), text).unwrap();
+    let model = "schema = 1\n[battery]\ncapacity_ah = 50\ninitial_soc = 0.5\nohmic_resistance_ohm = 0.001\nocv = [[0, 3.0], [1, 4.0]]\n";
+    fs::write(folder.join("m.toml"), model).unwrap();
+    let arguments = [
+        "explain",
+        "--model",
+        "m.toml",
+        "--recording",
+        "r.csv",
+        "--out",
+        "out",
+    ];
+    let output = twin(folder, &arguments);
+    assert_eq!(output.status.code(), Some(0), "{output:?}");
+    let page = fs::read_to_string(folder.join("out/report.html")).unwrap();
+    assert!(page.contains("<p>recorded: "));
+    assert!(!page.contains("; reference: "));
+}

@@ -87,7 +87,7 @@ fn the_models_of_this_project_are_read() {
 
 #[test]
 fn faults_name_line_key_and_what_was_expected() {
-    let cases: [(&str, &[&str]); 18] = [
+    let cases: [(&str, &[&str]); 33] = [
         (
             "schema = 1\n[sensor]\nstepp = 1\n",
             &["line 3", "stepp", "`step`", "`noise_coloured`"],
@@ -99,7 +99,7 @@ fn faults_name_line_key_and_what_was_expected() {
         ("[sensor]\n", &["schema"]),
         (
             "schema = 1\n[sensor]\nstep = \"x\"\n",
-            &["line 3", "key step", "string", "f64"],
+            &["line 3", "key step", "string", "expected a number"],
         ),
         (
             "schema = 1\n[sensor]\nnoise = -1\n",
@@ -166,7 +166,74 @@ fn faults_name_line_key_and_what_was_expected() {
             ],
         ),
         ("schema = 1\n[sensor\n", &["line 2"]),
+        (
+            "schema = 1\n[sensor]\naccuracy = 0.3\n",
+            &["line 3", "key accuracy", "a table { zero = …, gain = … }"],
+        ),
+        (
+            "schema = 1\n[sensor]\naverage = 1.5\n",
+            &["line 3", "key average", "a whole number"],
+        ),
+        (
+            "schema = 1\n[sensor]\nreference = 3\n",
+            &["line 3", "key reference", "text in quotes"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\nocv = 3.6\n",
+            &["line 4", "key ocv", "a list in brackets"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.lag]\ntau_s = -5\n",
+            &["line 4", "effects.lag.tau_s", "found -5", "zero or more"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.moving-average]\nwindow_s = -0.5\n",
+            &["moving-average.window_s", "-0.5", "zero or more"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.dead-band]\nthreshold_a = -3\n",
+            &["dead-band.threshold_a", "-3", "zero or more"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.hum]\nfrequency_hz = -5\namplitude_a = 1\n",
+            &["hum.frequency_hz", "-5", "zero or more"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.core-saturation]\nknee_a = -20\nsoftness = 1\n",
+            &["core-saturation.knee_a", "-20", "zero or more"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.sampled-window]\nperiod_s = 1\nduty = 7\n",
+            &["sampled-window.duty", "found 7", "from 0 to 1"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.clipping]\nhigh_a = -5\nlow_a = 5\n",
+            &["line 3", "effects.clipping", "-5 and 5", "not below low_a"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\n[effects.capacity]\ncapacity_ah = 0\n",
+            &["capacity.capacity_ah", "found 0", "above 0"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.capacity]\ncapacity_ah = 40\n",
+            &[
+                "line 3",
+                "effects.capacity",
+                "no [battery]",
+                "[battery] beside it",
+            ],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\n[effects.offset]\noffset_a = 1\n",
+            &["line 4", "effects.offset", "[sensor] beside it"],
+        ),
+        (
+            "schema = 1\n[columns]\ntemp_sensor = \"T7\"\n[sensor]\n",
+            &["line 3", "columns.temp_sensor", "temp_sensor_c"],
+        ),
     ];
+    // A name of one's own is a name if the file goes by it.
+    parse("schema = 1\n[columns]\nh_a = \"H\"\n[sensor]\nreference = \"h_a\"\n").unwrap();
     for (text, expected) in cases {
         let Err(Failure::Input(sentence)) = parse(text) else {
             panic!("taken: {text}");

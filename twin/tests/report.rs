@@ -225,6 +225,28 @@ fn the_summary_of_every_verdict_fits_a_screen_and_says_what_counts() {
     }
 }
 
+#[test]
+fn a_note_is_told_in_full_where_there_is_room() {
+    let mut report = report_sample::no_mismatch();
+    let long = "what is known about the input ".repeat(10) + "and what follows from it";
+    report.remarks = vec![long.clone(), long];
+    let screen = text::render(&report, 80);
+    assert!(screen.lines().count() <= 23, "{screen}");
+    assert!(!screen.contains('…'), "{screen}");
+    let words = screen.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert_eq!(words.matches("and what follows from it").count(), 2);
+}
+
+#[test]
+fn what_no_effect_changed_is_not_said_to_be_one() {
+    let caption = |report: &Report| html::render(report).contains("with the effects above");
+    let mut report = report_sample::explained();
+    assert!(caption(&report));
+    // The state of charge at the start was found, and nothing else.
+    report.effects.clear();
+    assert!(!caption(&report));
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 

@@ -12,7 +12,7 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
     let mut header = Header::default();
     let mut last_ns = 0_i64;
     let mut lines = Lines::new(source, reader);
-    while let Some((number, line)) = lines.next()? {
+    while let Some((number, line, _)) = lines.next()? {
         // Events begin with their time, everything else with a word or a comment mark.
         if !line.starts_with(|first: char| first.is_ascii_digit()) {
             header.line(line);

@@ -45,6 +45,8 @@ pub struct Counts {
     pub remote: u64,
     /// Other events.
     pub others: u64,
+    /// A last line without an end: it may be cut, and is left out.
+    pub cut: u64,
 }
 
 /// Takes the frames of a log one by one.
@@ -73,8 +75,8 @@ impl<'a, R: BufRead> Lines<'a, R> {
         }
     }
 
-    /// The next line with its number, without blanks around it.
-    fn next(&mut self) -> Result<Option<(u64, &str)>> {
+    /// The next line with its number, without blanks around it, and whether it has an end.
+    fn next(&mut self) -> Result<Option<(u64, &str, bool)>> {
         self.buffer.clear();
         self.number += 1;
         let mut limited = io::Read::take(&mut self.reader, LONGEST_LINE);
@@ -94,7 +96,8 @@ impl<'a, R: BufRead> Lines<'a, R> {
             ));
         }
         self.text = String::from_utf8_lossy(&self.buffer).into_owned();
-        Ok(Some((self.number, self.text.trim())))
+        let ended = self.buffer.ends_with(b"\n");
+        Ok(Some((self.number, self.text.trim(), ended)))
     }
 }
 

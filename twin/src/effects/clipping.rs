@@ -69,6 +69,10 @@ impl Effect for Clipping {
         true
     }
 
+    fn at_odds(&self, values: &[f64]) -> Option<&'static str> {
+        (values[0] < values[1]).then_some("high_a, not below low_a")
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (high, low) = (values[0], values[1]);
         scene

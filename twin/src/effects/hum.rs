@@ -13,7 +13,7 @@ static CARD: Card = Card {
     statement: "A ripple at the mains or inverter frequency is added, perhaps folded down by the sampling rate.",
     equation: "y = i + amplitude·sin(2π·frequency·t + φ), t from the first row on, φ is fitted beside",
     parameters: &[
-        Parameter::new("frequency_hz", "Hz", 1.0, Search::Smooth),
+        Parameter::new("frequency_hz", "Hz", 1.0, Search::Smooth).within(0.0, f64::INFINITY),
         Parameter::new("amplitude_a", "A", 0.0, Search::Linear),
         Parameter::internal("phase_rad", "rad", 0.0, Search::Smooth),
     ],

@@ -14,7 +14,9 @@ static CARD: Card = Card {
     equation: "R(SoC) = R·(1 + rise·(1 − SoC/knee)) below the knee",
     parameters: &[
         Parameter::new("rise", "1", 0.0, Search::Linear),
-        Parameter::new("knee_soc", "1", 0.3, Search::Smooth).open(),
+        Parameter::new("knee_soc", "1", 0.3, Search::Smooth)
+            .within(0.0, 1.0)
+            .open(),
     ],
     shows: "low state of charge",
     looks_like: &["resistance-temperature"],

@@ -26,7 +26,9 @@ static CARD: Card = Card {
     equation: "y = mean of i over the first duty·period of each period, held until the next (periods count from the recording's start)",
     parameters: &[
         Parameter::new("period_s", "s", 0.0, Search::Stepped),
-        Parameter::new("duty", "1", 1.0, Search::Stepped).open(),
+        Parameter::new("duty", "1", 1.0, Search::Stepped)
+            .within(0.0, 1.0)
+            .open(),
         Parameter::internal("phase_s", "s", 0.0, Search::Stepped),
     ],
     shows: "beats with periodic loads",

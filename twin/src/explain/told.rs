@@ -155,7 +155,11 @@ pub(super) fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> 
         recorded: bench.y.clone(),
         before: bench.plain.clone(),
         after: fit.predicted.clone(),
-        reference: bench.reference.clone(),
+        // A battery's is a current, which has no place on an axis of volts or per cent.
+        reference: match bench.problem.base {
+            Base::Sensor(_) => bench.reference.clone(),
+            Base::Battery(_) => Vec::new(),
+        },
         held_out_residual: held_residual.to_vec(),
         variables: locate::variables(bench)
             .into_iter()

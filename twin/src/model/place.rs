@@ -4,6 +4,21 @@ use toml_edit::{Document, Item};
 
 use crate::failure::Failure;
 
+/// What the reader of TOML calls what it expected, and what a reader of the file calls that; the first that fits counts.
+const IN_WORDS: [(&str, &str); 11] = [
+    ("f64", "a number"),
+    ("u8", "a whole number"),
+    ("u32", "a whole number"),
+    ("struct AccuracySpec", "a table { zero = …, gain = … }"),
+    ("struct Sensor", "a table, [sensor]"),
+    ("struct Charge", "a table, [charge]"),
+    ("struct BatteryText", "a table, [battery]"),
+    ("a map", "a table"),
+    ("a sequence", "a list in brackets"),
+    ("path string", "a file's name in quotes"),
+    ("a string", "text in quotes"),
+];
+
 /// A model file's text with the lines of its keys.
 pub(super) struct Places<'a> {
     source: &'a str,
@@ -34,7 +49,13 @@ impl<'a> Places<'a> {
 
     /// What the reader of TOML says, as one sentence.
     pub(super) fn syntax(&self, error: &toml::de::Error) -> Failure {
-        let message = error.message().trim().replace('\n', ", ");
+        let mut message = error.message().trim().replace('\n', ", ");
+        for (internal, words) in IN_WORDS {
+            message = message.replace(
+                &format!("expected {internal}"),
+                &format!("expected {words}"),
+            );
+        }
         let Some(span) = error.span() else {
             return Failure::Input(format!("{}: {message}", self.source));
         };

@@ -57,6 +57,9 @@ pub(super) fn item(
         .reference
         .iter()
         .fold(0.0_f64, |most, i| most.max(i.abs()));
+    if work.purpose == Purpose::Compare {
+        checks::counter(drive, &readings, interval_s, work.frame.source(), column)?;
+    }
     let (drive, mut observed, rows, resets) =
         differences(drive, &readings, &rows, interval_s, step_c, largest);
     if resets > 0 {

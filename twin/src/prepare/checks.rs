@@ -2,8 +2,9 @@
 
 use super::{FEWEST_ROWS, Frame, battery::PACK, seconds, series::median};
 use crate::{
+    effects::{self, Stage},
     failure::Failure,
-    model::Sensor,
+    model::{Model, Sensor},
     problem::{BatteryBase, Drive, Observed, Problem, View},
     report::format::count,
 };
@@ -16,6 +17,8 @@ const OPPOSITE: f64 = -0.5;
 const SURELY_OPPOSITE: f64 = -0.8;
 /// Below this magnitude of correlation the two have nothing in common.
 const UNRELATED: f64 = 0.1;
+/// A factor from which on a reading is more than off.
+const NO_GAIN: f64 = 5.0;
 /// A voltage further than this beyond the table's ends, as a factor, is not that of so many cells.
 const OTHER_CELLS: f64 = 1.8;
 /// A jump there and back is one if it is larger than this share of the spread of all, and than so many usual steps.
@@ -25,6 +28,8 @@ const WILD_STEPS: f64 = 20.0;
 const WILD_ROWS: usize = 3;
 /// More such readings than this share are no longer single ones.
 const WILD_MOST: f64 = 0.02;
+/// Steps' mean square, over the variance, below which values have a course: 2 is noise.
+const COURSE: f64 = 0.5;
 /// A share of the readings at an end of their range that is worth a remark.
 const CLIPPED_SHARE: f64 = 0.005;
 
@@ -64,6 +69,90 @@ pub(super) fn time_goes_on(frame: &Frame) -> Result<(), Failure> {
         ))),
         _ => Ok(()),
     }
+}
+
+/// Temperatures and supplies that a vehicle has, in °C and V.
+const TEMPERATURES_C: (f64, f64) = (-60.0, 200.0);
+const SUPPLIES_V: (f64, f64) = (0.0, 100.0);
+
+/// Surroundings are in the units of their names: a column of which no value can be, is not.
+pub(super) fn surroundings(frame: &Frame) -> Result<(), Failure> {
+    for (name, unit, (lowest, highest), instead) in [
+        ("temp_sensor_c", "°C", TEMPERATURES_C, "kelvin"),
+        ("temp_cell_c", "°C", TEMPERATURES_C, "kelvin"),
+        ("temp_ambient_c", "°C", TEMPERATURES_C, "kelvin"),
+        ("v_supply_v", "V", SUPPLIES_V, "mV"),
+    ] {
+        let values = frame.column(name).unwrap_or_default();
+        let known = values.iter().filter(|value| value.is_finite());
+        let (low, high) = known.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
+            (low.min(*value), high.max(*value))
+        });
+        let possible = values
+            .iter()
+            .any(|value| (lowest..=highest).contains(value));
+        if low <= high && !possible {
+            return Err(Failure::Input(format!(
+                "{}, column {}: found {low} … {high}, expected {unit}, {lowest} … {highest} (it may be in {instead})",
+                frame.source(),
+                frame.origin(name)
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// From here on a time is none in s, whatever it counts from: the year 5138.
+const NO_TIME_S: f64 = 1e11;
+/// Rows in whole numbers that are so far apart, or further, may be ms.
+const MAY_BE_MS: f64 = 10.0;
+
+/// Whether time is in s. Where it may be in ms, a remark.
+pub(super) fn milliseconds(frame: &Frame) -> Result<Option<String>, Failure> {
+    let t_s = frame.t_s();
+    let (source, column) = (frame.source(), frame.origin("t_s"));
+    if let Some(late) = t_s.iter().find(|t| t.abs() > NO_TIME_S) {
+        return Err(Failure::Input(format!(
+            "{source}, column {column}: found a time of {late}, expected s (since 1970 it may be in ms, µs or ns)"
+        )));
+    }
+    let mut steps: Vec<f64> = t_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    let step = median(&mut steps).unwrap_or_default();
+    // What a logger is set to: 10 ms, 20 ms, 50 ms, …; a minute is no such number.
+    let first_digit = step / 10_f64.powf(step.log10().floor());
+    let is_set = [1.0, 2.0, 5.0]
+        .iter()
+        .any(|digit| (first_digit - digit).abs() < 1e-9);
+    let whole = t_s.iter().all(|t| t.fract() == 0.0);
+    Ok((step >= MAY_BE_MS && is_set && whole).then(|| {
+        format!(
+            "rows of {source} are {step} s apart by its column {column}: if that is in ms, every time that is said is a thousand \
+             times too long"
+        )
+    }))
+}
+
+/// No clock is off by more than the recording is long.
+pub(super) fn moments(model: &Model, problem: &Problem) -> Result<(), Failure> {
+    let t_s = &problem.drive.t_s;
+    let spans = problem.drive.segments.iter();
+    let span_s: f64 = spans.map(|rows| t_s[rows.end - 1] - t_s[rows.start]).sum();
+    for (id, values) in &problem.modelled {
+        let Some(card) = effects::find_with(id, values.len()).map(|effect| effect.card()) else {
+            continue;
+        };
+        for (parameter, value) in card.parameters.iter().zip(values) {
+            if card.stage == Stage::Clock && parameter.unit == "s" && value.abs() > span_s {
+                return Err(Failure::Input(format!(
+                    "{}, key effects.{id}.{}: found {value}, expected less than the recording's {}",
+                    model.source,
+                    parameter.name,
+                    seconds(span_s)
+                )));
+            }
+        }
+    }
+    Ok(())
 }
 
 /// There is enough to say something.
@@ -327,6 +416,96 @@ pub(super) fn pair(
     Ok(())
 }
 
+/// Seconds of an hour.
+const HOUR_S: f64 = 3600.0;
+/// A ratio is that of C and Ah if it is within this factor of one.
+const HOUR_WITHIN: f64 = 1.25;
+
+/// Unit and sign of a charge counter, against the charge of the reference.
+pub(super) fn counter(
+    drive: &Drive,
+    readings: &Observed,
+    interval_s: f64,
+    source: &str,
+    column: &str,
+) -> Result<(), Failure> {
+    let mut charge_c = vec![0.0; drive.len()];
+    for rows in &drive.segments {
+        for row in rows.start + 1..rows.end {
+            let mean_a = 0.5 * (drive.reference[row - 1] + drive.reference[row]);
+            let step_s = drive.t_s[row] - drive.t_s[row - 1];
+            charge_c[row] = charge_c[row - 1] + mean_a * step_s;
+        }
+    }
+    let charge = Drive {
+        reference: charge_c.into(),
+        ..drive.clone()
+    };
+    // Over longer times noise and steps matter less.
+    let span_s = match (drive.t_s.first(), drive.t_s.last()) {
+        (Some(first), Some(last)) => last - first,
+        _ => 0.0,
+    };
+    let apart_s = (span_s / (2 * FEWEST_ROWS) as f64).max(interval_s);
+    let mut last: Option<usize> = None;
+    let mut moved = Vec::new();
+    for row in (0..readings.t_s.len()).filter(|row| readings.valid[*row]) {
+        let Some(before) =
+            last.filter(|before| readings.segment_of(*before) == readings.segment_of(row))
+        else {
+            last = Some(row);
+            continue;
+        };
+        if readings.t_s[row] - readings.t_s[before] >= 0.999 * apart_s {
+            moved.push((
+                reference_at(&charge, readings, row) - reference_at(&charge, readings, before),
+                readings.value[row] - readings.value[before],
+            ));
+            last = Some(row);
+        }
+    }
+    if moved.len() < FEWEST_ROWS / 2 {
+        return Ok(());
+    }
+    let of_reference = spread(moved.iter().map(|(reference, _)| *reference));
+    let of_counter = spread(moved.iter().map(|(_, counted)| *counted));
+    // A counter that is set anew, or begins again at its end, jumps: once or twice, and further than all else.
+    let mut counted: Vec<f64> = moved.iter().map(|(_, counted)| *counted).collect();
+    let middle = median(&mut counted).unwrap_or_default();
+    let kept = moved
+        .iter()
+        .filter(|(_, counted)| (counted - middle).abs() <= of_counter);
+    let together = correlation(kept.copied());
+    if together.abs() < -SURELY_OPPOSITE {
+        return Ok(());
+    }
+    let ratio = of_reference / of_counter;
+    let unit = if (ratio / HOUR_S).ln().abs() <= HOUR_WITHIN.ln() {
+        Some("Ah")
+    } else {
+        thousands(ratio).map(|power| {
+            if power > 0 {
+                "thousands of C"
+            } else {
+                "thousandths of C"
+            }
+        })
+    };
+    if let Some(unit) = unit {
+        return Err(Failure::Input(format!(
+            "{source}, column {column}: found a charge that moves by {of_counter:.4} where the reference's moves by \
+             {of_reference:.4} C, expected C in both (it may be in {unit}, or the time not in s)"
+        )));
+    }
+    if together < 0.0 {
+        return Err(Failure::Input(format!(
+            "{source}: {column} falls where the reference's charge rises (correlation {together:.2}): found opposite signs, \
+             expected discharge positive in both; to turn one: --map {column}=-{column}"
+        )));
+    }
+    Ok(())
+}
+
 /// Whether the reference is one: remarks on what it does that no current does.
 pub(super) fn plausible(
     drive: &Drive,
@@ -343,7 +522,16 @@ pub(super) fn plausible(
     let together = correlation(beside(drive, observed, &wild.rows));
     if together.abs() < UNRELATED {
         remarks.push(format!(
-            "{measured} does not follow {reference} (correlation {together:.2}): the reference may be that of another conductor"
+            "{measured} does not follow {reference} (correlation {together:.2}): the sensor may be dead, or the reference be that of another conductor"
+        ));
+    }
+    let spread_x = spread(beside(drive, observed, &wild.rows).map(|(reference, _)| reference));
+    let spread_y = spread(beside(drive, observed, &wild.rows).map(|(_, reading)| reading));
+    let factor = f64::max(spread_x / spread_y, spread_y / spread_x);
+    if factor > NO_GAIN && together > -SURELY_OPPOSITE {
+        remarks.push(format!(
+            "{measured} moves by {spread_y:.4} where {reference} moves by {spread_x:.4}, a factor of {factor:.4}: more than any gain \
+             is off by; one of the two may be scaled, or in another unit"
         ));
     }
     if let Some(full_scale) = sensor.full_scale {
@@ -463,7 +651,9 @@ fn stuck(drive: &Drive, observed: &Observed, reference: &str, measured: &str) ->
             let inside = (start..end)
                 .filter(|row| observed.valid[*row])
                 .map(|row| observed.value[row]);
-            if inside.clone().count() >= 20 && spread(inside) > 0.3 * wide {
+            // At 0 the car may stand.
+            let stands = drive.reference[start] == 0.0 || inside.clone().count() < 20;
+            if !stands && spread(inside.clone()) > 0.3 * wide && moves(inside) {
                 return Some(format!(
                     "{reference} stands at {} for {} from {} s on while {measured} moves: the reference may be at fault",
                     drive.reference[start],
@@ -475,6 +665,16 @@ fn stuck(drive: &Drive, observed: &Observed, reference: &str, measured: &str) ->
         }
     }
     None
+}
+
+/// Whether values move by more than noise does: of what has no course, the steps' mean square is twice the variance.
+fn moves(values: impl Iterator<Item = f64> + Clone) -> bool {
+    let count = values.clone().count() as f64;
+    let mean = values.clone().sum::<f64>() / count;
+    let variance = values.clone().map(|x| (x - mean).powi(2)).sum::<f64>() / count;
+    let steps = values.clone().zip(values.skip(1));
+    let steps = steps.map(|(from, to)| (to - from).powi(2)).sum::<f64>() / (count - 1.0);
+    steps < COURSE * variance
 }
 
 /// Units and signs of a battery.
@@ -525,6 +725,17 @@ pub(super) fn battery(
         return Err(Failure::Input(format!(
             "{source}, column {name}: found voltages around {middle:.4} V, expected some within reach of the open-circuit \
              voltage, {low:.4} … {high:.4} V{hint}"
+        )));
+    }
+    let mut amperes: Vec<f64> = pairs.clone().map(|(current, _)| current.abs()).collect();
+    let last = amperes.len() - 1;
+    let (_, most, _) =
+        amperes.select_nth_unstable_by((0.98 * last as f64) as usize, f64::total_cmp);
+    let drop = *most * base.resistance_ohm;
+    if drop > high {
+        return Err(Failure::Input(format!(
+            "{source}, column {current}: found currents up to {most:.4}, which over ohmic_resistance_ohm are {drop:.4} V, more than \
+             the open-circuit voltage, {high:.4} V; expected A, and Ω (one of the two may be in thousandths)"
         )));
     }
     // From one reading to the next the slow open-circuit voltage hardly matters.

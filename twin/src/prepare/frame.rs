@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use recording::{Mapping, Recording, Table, convert};
+use recording::{Error, Mapping, Recording, Table, convert, error::Kind};
 
 use super::{Inputs, PAIRS, SURROUNDINGS};
 use crate::{failure::Failure, model::Model};
@@ -54,7 +54,7 @@ impl Frame {
 
     /// A column that must be there.
     pub fn need(&self, name: &str) -> Result<&[f64], Failure> {
-        Ok(self.recording.need(name)?)
+        self.recording.need(name).map_err(hinted)
     }
 
     /// Columns that are in the file and hold no numbers, each with the reason.
@@ -142,13 +142,23 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
     Ok((frame, Some(other)))
 }
 
+/// A column that is missing may be there by another name.
+fn hinted(error: Error) -> Failure {
+    let hint = if error.kind() == Kind::ColumnMissing {
+        "; other names: --map NAME=COLUMN, or [columns] in the model file"
+    } else {
+        ""
+    };
+    Failure::Input(format!("{error}{hint}"))
+}
+
 fn mapped(table: Table, wanted: &[(String, String)]) -> Result<Frame, Failure> {
     let mut mapping = Mapping::new();
     for (name, column) in wanted {
         mapping.add(name, column)?;
     }
     Ok(Frame {
-        recording: table.mapped(&mapping)?.into_recording()?,
+        recording: table.mapped(&mapping)?.into_recording().map_err(hinted)?,
         named: wanted.to_vec(),
     })
 }

@@ -149,7 +149,7 @@ fn finer(drive: &Drive) -> Drive {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
+#[allow(clippy::unwrap_used, clippy::single_range_in_vec_init)]
 mod tests {
     use super::*;
     use crate::problem::{Accuracy, Coloured, Observed, SensorBase, View};

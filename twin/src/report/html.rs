@@ -493,7 +493,8 @@ fn before_and_after(page: &mut String, report: &Report, drawn: &[(usize, Picture
         if let Some(signal) = signal.filter(|_| !pictures.same) {
             error_bars(page, signal);
         }
-        signal_figures(page, number, &plots.name, &plots.unit, pictures);
+        let named = report.effects.iter().any(|it| it.signal == plots.name);
+        signal_figures(page, number, (&plots.name, &plots.unit), named, pictures);
     }
     page.push_str("</section>\n");
 }
@@ -572,7 +573,13 @@ fn figure(page: &mut String, figure: &Figure<'_>, words: &Words) {
     ));
 }
 
-fn signal_figures(page: &mut String, number: usize, name: &str, unit: &str, pictures: &Pictures) {
+fn signal_figures(
+    page: &mut String,
+    number: usize,
+    (name, unit): (&str, &str),
+    named: bool,
+    pictures: &Pictures,
+) {
     let per_second = quantity(&format!("{name},"), unit);
     let after = if pictures.same {
         "No effect was added to the simulation."
@@ -592,6 +599,8 @@ fn signal_figures(page: &mut String, number: usize, name: &str, unit: &str, pict
                 axes: format!("{per_second} over time, s"),
                 caption: if pictures.same {
                     "Recorded and simulated."
+                } else if !named {
+                    "Recorded, as simulated before, and as simulated within what the model file leaves open."
                 } else {
                     "Recorded, as simulated before, and as simulated with the effects above."
                 }

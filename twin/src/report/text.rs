@@ -24,14 +24,26 @@ struct Fullness {
     apart: bool,
 }
 
+impl Fullness {
+    /// Lines of one note: all of it, or two of a full screen.
+    fn notes(self) -> usize {
+        if self.lines > 3 {
+            self.lines
+        } else {
+            self.lines.min(2)
+        }
+    }
+}
+
 /// The report in at most [`LINES`] lines of at most `width` characters (and 40 at least). What does not fit is counted, and
 /// is in the page.
 pub fn render(report: &Report, width: usize) -> String {
     let width = width.max(NARROWEST);
     // The fullest that fits: a parameter cut short is worse than a place that is only counted.
-    let generous = (3..=8)
-        .rev()
-        .flat_map(|entries| [(3, true), (2, true), (2, false)].map(|(l, a)| (entries, l, a)));
+    let generous = (3..=8).rev().flat_map(|entries| {
+        [(8, true), (8, false), (3, true), (2, true), (2, false)]
+            .map(|(lines, apart)| (entries, lines, apart))
+    });
     let tight = (0..=2)
         .rev()
         .flat_map(|entries| [(2, false), (1, false)].map(|(l, a)| (entries, l, a)));
@@ -242,13 +254,13 @@ fn left(report: &Report, width: usize, fullness: Fullness) -> Vec<String> {
             quantity(&significant(left.rmse, 3), unit_of(report, &left.signal)),
             percent(left.explainable_share),
         );
-        wrap(&mut lines, &words, 0, width, fullness.lines.min(2));
+        wrap(&mut lines, &words, 0, width, fullness.notes());
     }
     more(&mut lines, report.unexplained.len(), shown, "remainder");
     let shown = fullness.entries.saturating_sub(1).min(3);
     for remark in report.remarks.iter().take(shown) {
         let words = format!("Note: {remark}");
-        wrap(&mut lines, &words, 0, width, fullness.lines.min(2));
+        wrap(&mut lines, &words, 0, width, fullness.notes());
     }
     more(&mut lines, report.remarks.len(), shown, "note");
     lines
