@@ -6,6 +6,7 @@ use core_logic::design_parameters::METER_POLL_MS;
 
 use super::{FEWEST_ROWS, Item, Purpose, Work, checks, phase, series};
 use crate::{
+    effects::scene::Cursor,
     failure::Failure,
     model::Sensor,
     problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View},
@@ -96,9 +97,12 @@ pub(super) fn item(
             reported
         };
         let slack_s = if spec.age_s > 0.0 { TICK_S } else { 0.0 };
-        let (tick_s, _) = phase::closest(0.0, (slack_s, 1), &observed, run);
+        let (tick_s, reported) = phase::closest(0.0, (slack_s, 1), &observed, run);
         // The jitter is a moment that nothing tells, and much the same all over a recording.
-        let (later_s, reported) = phase::settled(tick_s, 0.5 * spec.jitter_s, &observed, run);
+        let rate = rates(&drive, &observed, tick_s, sensor.held_reference);
+        let most_s = 0.5 * spec.jitter_s;
+        let later_s = tick_s + phase::later_s(&observed, &reported, &rate).clamp(-most_s, most_s);
+        let reported = run(later_s);
         observed.t_s.iter_mut().for_each(|t| *t -= later_s);
         base.reading = reported.current_a;
         if drive.range_high.is_none() && board.has_two_ranges() {
@@ -193,6 +197,30 @@ fn differences(
     }
     observed.t_s = times_s.into();
     (drive, observed, kept, resets)
+}
+
+/// How fast the mean current of each reading changes if both of its ends are taken earlier, from `later_s` on: in A/s.
+fn rates(drive: &Drive, observed: &Observed, later_s: f64, held: bool) -> Vec<f64> {
+    let mut rates = vec![f64::NAN; observed.t_s.len()];
+    for (segment, rows) in observed.stretches.iter() {
+        let own = drive.segments.get(segment).cloned();
+        let Some(own) = own.filter(|own| !own.is_empty()) else {
+            continue;
+        };
+        let mut cursor = Cursor::new(&drive.t_s, own);
+        let mut last: Option<(f64, f64)> = None;
+        for row in rows {
+            let now_s = observed.t_s[row] - later_s;
+            let now_a = cursor.value(&drive.reference, now_s, held);
+            if let Some((before_s, before_a)) = last
+                && now_s > before_s
+            {
+                rates[row] = (before_a - now_a) / (now_s - before_s);
+            }
+            last = Some((now_s, now_a));
+        }
+    }
+    rates
 }
 
 /// The same of a simulated counter.

@@ -28,26 +28,46 @@ pub(super) fn closest(
     best
 }
 
-/// What the board reports if its readings are later than stated by the time at which they fit best, within `slack_s` to either side
-/// of `later_s`, and that time in s. A shift this small moves a fit's error along a parabola, whose lowest point three trials tell.
-pub(super) fn settled(
-    later_s: f64,
-    slack_s: f64,
-    observed: &Observed,
-    run: impl Fn(f64) -> Reported,
-) -> (f64, Reported) {
-    let here = run(later_s);
-    if slack_s <= 0.0 {
-        return (later_s, here);
+/// By how much later than simulated readings were taken, in s, from how fast they change with it (`rate`, in the view's unit per s, at
+/// each row): least squares beside a straight line in each range. Rows over a change of the range are of both, and left out.
+pub(super) fn later_s(observed: &Observed, reported: &Reported, rate: &[f64]) -> f64 {
+    let (mut along, mut size) = (0.0, 0.0);
+    let high_at = |row: usize| reported.range_high[row] > 0.5;
+    for high in [false, true] {
+        let rows: Vec<usize> = (1..observed.value.len())
+            .filter(|&row| observed.valid[row] && high_at(row) == high && high_at(row - 1) == high)
+            .filter(|&row| {
+                let known = [reported.current_a[row], observed.value[row], rate[row]];
+                known.iter().all(|value| value.is_finite())
+            })
+            .collect();
+        if rows.len() < 4 {
+            continue;
+        }
+        // What a line through the readings takes of either is no sign of a time.
+        let left = |of: &dyn Fn(usize) -> f64| -> Vec<f64> {
+            let count = rows.len() as f64;
+            let x = |row: usize| reported.current_a[row];
+            let (mean_x, mean) = (
+                rows.iter().map(|&row| x(row)).sum::<f64>() / count,
+                rows.iter().map(|&row| of(row)).sum::<f64>() / count,
+            );
+            let spread: f64 = rows.iter().map(|&row| (x(row) - mean_x).powi(2)).sum();
+            let together: f64 = rows
+                .iter()
+                .map(|&row| (x(row) - mean_x) * (of(row) - mean))
+                .sum();
+            let slope = together / spread.max(f64::MIN_POSITIVE);
+            rows.iter()
+                .map(|&row| of(row) - mean - slope * (x(row) - mean_x))
+                .collect()
+        };
+        let by_time = left(&|row| rate[row]);
+        let off = left(&|row| observed.value[row] - reported.current_a[row]);
+        along += by_time.iter().zip(&off).map(|(a, b)| a * b).sum::<f64>();
+        size += by_time.iter().map(|a| a * a).sum::<f64>();
     }
-    let middle = misfit(observed, &here);
-    let [before, after] = [-slack_s, slack_s].map(|by_s| misfit(observed, &run(later_s + by_s)));
-    let bend = before + after - 2.0 * middle;
-    if bend.is_nan() || bend <= 0.0 {
-        return (later_s, here);
-    }
-    let lowest_s = later_s + slack_s * (0.5 * (before - after) / bend).clamp(-1.0, 1.0);
-    (lowest_s, run(lowest_s))
+    if size > 0.0 { along / size } else { 0.0 }
 }
 
 /// Mean square of what a straight line in each range leaves.
