@@ -172,6 +172,16 @@ impl Course<'_> {
         Some((smooth, told))
     }
 
+    /// Whether what was named on another course, fitted here, makes the loss smaller by so much: if not, to decide again is in vain.
+    /// Where nothing was named there is nothing to ask with.
+    fn may_fit(&self, other: &Decided, shown: &Fit, by: f64) -> bool {
+        let read = Workbench::new(&self.problem, &[]);
+        let here = fit::fit(&read, &other.selection.fit.model, None);
+        let sigma = shown.sigma.min(here.sigma);
+        other.names_nothing()
+            || fit::loss(&shown.residual, sigma) - fit::loss(&here.residual, sigma) > by
+    }
+
     /// What is decided about it, and what that leaves of the readings.
     fn decided(&self, options: &Options, progress: &mut dyn FnMut(f64, &str)) -> (Decided, Fit) {
         let read = Workbench::new(&self.problem, &options.without);
@@ -208,6 +218,7 @@ fn one(
     let mut between = None;
     if decided.asks_between()
         && let Some((smooth, told)) = course.smooth()
+        && smooth.may_fit(&decided, &shown, if told { -CLEARLY } else { CLEARLY })
     {
         let (again, there) = smooth.decided(options, progress);
         let sigma = shown.sigma.min(there.sigma);
