@@ -175,11 +175,10 @@ impl Course<'_> {
     /// Whether what was named on another course, fitted here, makes the loss smaller by so much: if not, to decide again is in vain.
     /// Where nothing was named there is nothing to ask with.
     fn may_fit(&self, other: &Decided, shown: &Fit, by: f64) -> bool {
-        let read = Workbench::new(&self.problem, &[]);
-        let here = fit::fit(&read, &other.selection.fit.model, None);
-        let sigma = shown.sigma.min(here.sigma);
-        other.names_nothing()
-            || fit::loss(&shown.residual, sigma) - fit::loss(&here.residual, sigma) > by
+        other.names_nothing() || {
+            let read = Workbench::new(&self.problem, &[]);
+            gained(shown, &fit::fit(&read, &other.selection.fit.model, None)) > by
+        }
     }
 
     /// What is decided about it, and what that leaves of the readings.
@@ -203,6 +202,13 @@ impl Course<'_> {
     }
 }
 
+/// By how much the loss is smaller with the second of two fits, both in the smaller spread.
+fn gained(one: &Fit, other: &Fit) -> f64 {
+    let sigma = one.sigma.min(other.sigma);
+    fit::loss(&one.residual, sigma) - fit::loss(&other.residual, sigma)
+}
+
+/// One signal: decided with the reference in straight lines, and again with a smooth one where that may be better.
 fn one(
     problem: &Problem,
     holdouts: &[Holdout],
@@ -210,25 +216,34 @@ fn one(
     report: &mut Report,
     progress: &mut dyn FnMut(f64, &str),
 ) -> Part {
-    let mut course = Course {
+    let straight = Course {
         problem: Cow::Borrowed(problem),
         holdouts: Cow::Borrowed(holdouts),
     };
-    let (mut decided, mut shown) = course.decided(options, progress);
-    let mut between = None;
+    let (decided, shown) = straight.decided(options, progress);
     if decided.asks_between()
-        && let Some((smooth, told)) = course.smooth()
-        && smooth.may_fit(&decided, &shown, if told { -CLEARLY } else { CLEARLY })
+        && let Some((smooth, told)) = straight.smooth()
     {
-        let (again, there) = smooth.decided(options, progress);
-        let sigma = shown.sigma.min(there.sigma);
-        let gained = fit::loss(&shown.residual, sigma) - fit::loss(&there.residual, sigma);
-        if gained > if told { -CLEARLY } else { CLEARLY } {
-            let errors = [&shown, &there].map(|fit| rms(fit.residual.iter().copied()));
-            (course, decided, shown) = (smooth, again, there);
-            between = Some(errors);
+        let enough = if told { -CLEARLY } else { CLEARLY };
+        if smooth.may_fit(&decided, &shown, enough) {
+            let (again, there) = smooth.decided(options, progress);
+            if gained(&shown, &there) > enough {
+                let errors = [&shown, &there].map(|fit| rms(fit.residual.iter().copied()));
+                return tell(&smooth, (again, &there), Some(errors), options, report);
+            }
         }
     }
+    tell(&straight, (decided, &shown), None, options, report)
+}
+
+/// Puts what was decided about a signal into the report; `between` as in [`times_found`].
+fn tell(
+    course: &Course<'_>,
+    (decided, shown): (Decided, &Fit),
+    between: Option<[f64; 2]>,
+    options: &Options,
+    report: &mut Report,
+) -> Part {
     let problem = &*course.problem;
     let read = Workbench::new(problem, &options.without);
     let white = read.whitened();
@@ -273,7 +288,7 @@ fn one(
     } else {
         locate::locate(&read, &plain_residual, options.seed)
     };
-    attribute(&read, &shown, &mut locations);
+    attribute(&read, shown, &mut locations);
     report.locations.extend(locations);
     report
         .effects
@@ -300,9 +315,9 @@ fn one(
         .remarks
         .extend(times_found(&read, &selection.fit, between));
     if verdict != Verdict::Unknown {
-        report.remarks.extend(slips(&read, &shown));
+        report.remarks.extend(slips(&read, shown));
     }
-    report.plots.push(plots(&read, &shown, &held.read));
+    report.plots.push(plots(&read, shown, &held.read));
     let mut sentence = sentence(
         bench,
         &selection,
@@ -409,7 +424,7 @@ fn decide(
         &mut selection,
         verdict,
         (left, &held),
-        (confirmed && not_there.is_none(), taken_back),
+        (confirmed, taken_back),
         not_there,
         unavoidable,
     );

@@ -25,6 +25,21 @@ fn twin(folder: &Path, arguments: &[&str]) -> Output {
         .unwrap()
 }
 
+/// `r.csv` under `m.toml`, into `out`.
+fn explained(folder: &Path, more: &[&str]) -> Output {
+    let mut arguments = vec![
+        "explain",
+        "--model",
+        "m.toml",
+        "--recording",
+        "r.csv",
+        "--out",
+        "out",
+    ];
+    arguments.extend_from_slice(more);
+    twin(folder, &arguments)
+}
+
 /// A drive, and what the simulated board reads with a gain and an offset that the model lacks, and with noise.
 fn recording(folder: &Path, seed: u64) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
@@ -208,18 +223,7 @@ fn a_power_sensor_in_its_own_words() {
         "schema = 1\n[sensor]\nnoise = 0.09\n",
     )
     .unwrap();
-    let arguments = [
-        "explain",
-        "--model",
-        "m.toml",
-        "--recording",
-        "r.csv",
-        "--out",
-        "out",
-        "--without",
-        "hum",
-    ];
-    let output = twin(folder, &arguments);
+    let output = explained(folder, &["--without", "hum"]);
     let summary = String::from_utf8(output.stdout).unwrap();
     assert_eq!(output.status.code(), Some(0), "{summary}");
     assert!(
@@ -258,16 +262,7 @@ fn a_current_is_on_no_axis_of_volts() {
     fs::write(folder.join("r.csv"), text).unwrap();
     let model = "schema = 1\n[battery]\ncapacity_ah = 50\ninitial_soc = 0.5\nohmic_resistance_ohm = 0.001\nocv = [[0, 3.0], [1, 4.0]]\n";
     fs::write(folder.join("m.toml"), model).unwrap();
-    let arguments = [
-        "explain",
-        "--model",
-        "m.toml",
-        "--recording",
-        "r.csv",
-        "--out",
-        "out",
-    ];
-    let output = twin(folder, &arguments);
+    let output = explained(folder, &[]);
     assert_eq!(output.status.code(), Some(0), "{output:?}");
     let page = fs::read_to_string(folder.join("out/report.html")).unwrap();
     assert!(page.contains("<p>recorded: "));

@@ -122,8 +122,7 @@ impl Effect for CoreHysteresis {
 
     /// Of loops without time there are a few, and signs of their blocks are no placebos for shapes as free as the last two.
     fn applies(&self, problem: &Problem) -> bool {
-        let free = matches!(self.form, Form::Dragged | Form::Added);
-        sensing(problem) && !(free && problem.quasi_static())
+        sensing(problem) && !(self.remembers() && problem.quasi_static())
     }
 
     /// The sign that a relay keeps changes at once, where a turn of the current just reaches it.
@@ -223,46 +222,46 @@ impl Effect for CoreHysteresis {
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
-        if let &[remanence_a, coercivity_a, spread] = values {
-            let relays = Relays::new(remanence_a, coercivity_a, spread);
-            for rows in scene.drive.operations() {
-                relays.add(&mut scene.signal[rows]);
-            }
-            return;
-        }
-        if let &[remanence_a, coercivity_a, beta, before] = values {
-            let drag = Drag::new(remanence_a, coercivity_a, beta);
-            for rows in scene.drive.operations() {
-                drag.add(before.clamp(-1.0, 1.0), &mut scene.signal[rows]);
-            }
-            return;
-        }
-        if let &[remanence_a, coercivity_a, spread, scatter, before] = values {
-            let plays = Plays::new(remanence_a, coercivity_a, spread, scatter);
-            for rows in scene.drive.operations() {
-                plays.add(before.clamp(-1.0, 1.0), &mut scene.signal[rows]);
-            }
-            return;
-        }
         // The core comes round within full range; how far a recording goes is no property of it.
         let full_scale = scene
             .sensor
             .and_then(|sensor| sensor.full_scale)
             .unwrap_or(f64::INFINITY);
-        let core = MagneticCore::new(
-            &MagneticCoreConfig {
-                remanence_a: values[0],
-                coercivity_a: values[1],
-                ..MagneticCoreConfig::default()
-            },
-            full_scale,
-        );
-        for rows in scene.drive.operations() {
-            let mut state = MagneticCoreState::default();
-            for value in &mut scene.signal[rows] {
-                state = core.magnetise(&state, *value);
-                *value += core.zero_error_a(&state);
+        let mut each = |add: &dyn Fn(&mut [f64])| {
+            for rows in scene.drive.operations() {
+                add(&mut scene.signal[rows]);
             }
+        };
+        match (self.form, values) {
+            (Form::Gapped, &[remanence_a, coercivity_a]) => {
+                let config = MagneticCoreConfig {
+                    remanence_a,
+                    coercivity_a,
+                    ..MagneticCoreConfig::default()
+                };
+                let core = MagneticCore::new(&config, full_scale);
+                each(&|signal| {
+                    let mut state = MagneticCoreState::default();
+                    for value in signal {
+                        state = core.magnetise(&state, *value);
+                        *value += core.zero_error_a(&state);
+                    }
+                });
+            }
+            (Form::Closed, &[remanence_a, coercivity_a, spread]) => {
+                let relays = Relays::new(remanence_a, coercivity_a, spread);
+                each(&|signal| relays.add(signal));
+            }
+            (Form::Dragged, &[remanence_a, coercivity_a, beta, before]) => {
+                let drag = Drag::new(remanence_a, coercivity_a, beta);
+                each(&|signal| drag.add(before.clamp(-1.0, 1.0), signal));
+            }
+            (Form::Added, &[remanence_a, coercivity_a, spread, scatter, before]) => {
+                let plays = Plays::new(remanence_a, coercivity_a, spread, scatter);
+                each(&|signal| plays.add(before.clamp(-1.0, 1.0), signal));
+            }
+            // Values come in the number that the card has.
+            _ => {}
         }
     }
 }
@@ -327,7 +326,7 @@ impl Relays {
 
 /// Play operators of a magnetisation.
 const PLAYS: usize = 8;
-/// Middles of so many parts of a normal distribution that are equally likely.
+/// Middles of so many parts of a normal distribution that are equally likely: its quantiles at (k + ½)/8.
 const QUANTILES: [f64; PLAYS] = [
     -1.534_12, -0.887_15, -0.488_78, -0.157_31, 0.157_31, 0.488_78, 0.887_15, 1.534_12,
 ];
@@ -515,7 +514,7 @@ mod tests {
     }
 
     #[test]
-    fn both_forms_leave_the_remanence_that_they_say() {
+    fn a_closed_core_leaves_the_remanence_that_it_says() {
         // A swing to full range and back through the relays' ramps, and to the other side by the coercive current.
         let relays = Relays::new(3.0, 20.0, 1.2);
         let mut signal: Vec<f64> = (0..=200).map(f64::from).collect();

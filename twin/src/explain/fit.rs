@@ -387,9 +387,9 @@ pub fn in_the_mean(bench: &Workbench<'_>, from: Fit) -> Fit {
         return best;
     }
     let most = WORSE_BY * dot(&best.residual, &best.residual);
+    let even = vec![1.0; best.residual.len()];
     for _ in 0..STEPS {
         let slope = best.slope(bench);
-        let even = vec![1.0; best.residual.len()];
         let (normal, right) = normal(&slope.columns, &even, &best.residual, 0..even.len());
         let by = solve(&normal, &right, 1e-9);
         let model = slope.moved(bench, &best.model, by.as_slice());

@@ -924,7 +924,8 @@ fn rivals(
     let mut count: Vec<(&'static str, usize)> = Vec::new();
     for (rank, entry) in screening.entries.iter().enumerate() {
         let other = entry.member.effect;
-        if entry.gain <= RIVALS * taken || other.card().id == id || !joins(model, other) {
+        // What may not join the others is not screened.
+        if entry.gain <= RIVALS * taken || other.card().id == id {
             continue;
         }
         let known = count
@@ -1110,7 +1111,7 @@ fn name(
                         beside
                     };
                     share(bench, &without, other) >= least
-                        // What the other effects' equations may be off by does not decide between two.
+                        // What the other effects' equations, and uneven stamps, may be off by does not decide between two.
                         && (apart(bench, &now.predicted, &other.predicted) < as_good || !beaten(bench, other, now))
                         // At the end of what is physics it cannot be named, and speaks against another's being certain.
                         && small(bench, &without, other, last, 1.0).is_none()

@@ -73,13 +73,14 @@ pub(super) fn attribute(bench: &Workbench<'_>, fit: &Fit, locations: &mut [Locat
 }
 
 /// The unit of a parameter in this problem: `A` in the effects table stands for the view's unit.
-pub(super) fn unit(problem: &Problem, unit: &str) -> String {
+fn unit(problem: &Problem, unit: &str) -> String {
     match problem.view {
         crate::problem::View::Sensor if problem.unit != "A" => unit.replace('A', &problem.unit),
         _ => unit.to_owned(),
     }
 }
 
+/// The named effects with their values, intervals and evidence; `beside` as in [`intervals::intervals`].
 pub(super) fn effects(
     bench: &Workbench<'_>,
     selection: &Selection,
@@ -143,6 +144,7 @@ fn statement(of_currents: &str, unit: &str) -> String {
     }
 }
 
+/// The series that the page draws; `held_residual` is what held-out blocks leave, NaN elsewhere.
 pub(super) fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> SignalPlots {
     let step = bench.scale.reading_step_s;
     let plain = bench.residual(&bench.plain);
@@ -178,6 +180,7 @@ pub(super) fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> 
     }
 }
 
+/// The verdict in one sentence; `vetoed` is what was taken back for a file that was never fitted.
 pub(super) fn sentence(
     bench: &Workbench<'_>,
     selection: &Selection,
@@ -278,7 +281,8 @@ fn base_differs(nuisance: Nuisance) -> Option<String> {
     (!found.is_empty()).then(|| found.join(" and "))
 }
 
-/// What the times of the readings, and the reference between its rows, were found to be beside the effects.
+/// What the times of the readings, and the reference between its rows, were found to be beside the effects. `course`: the error with
+/// straight lines and with a smooth course, if that was taken.
 pub(super) fn times_found(
     bench: &Workbench<'_>,
     fit: &Fit,
@@ -304,6 +308,7 @@ pub(super) fn times_found(
     aligned.into_iter().chain(smooth).collect()
 }
 
+/// What is written into the extended model file.
 pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
     let values = |member: &Member| {
         let names = member

@@ -19,7 +19,7 @@ const VAGUE: f64 = 100.0;
 const STAND_INS: usize = 12;
 
 /// Whether values would have to differ from stretch to stretch by more than noise makes them, and by much.
-pub(super) fn waver(bench: &Workbench<'_>, member: &Member, variation: &Variation) -> bool {
+fn waver(bench: &Workbench<'_>, member: &Member, variation: &Variation) -> bool {
     variation.deviations > select::CERTAIN
         && variation.share > (WAVERS * roughness(bench, member)).powi(2)
 }

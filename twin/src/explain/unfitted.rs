@@ -212,11 +212,10 @@ pub(super) fn veto(
         let Some((index, without, ratio)) = found.filter(|(_, _, ratio)| *ratio > WORSE) else {
             break;
         };
-        vetoed.push(selection.fit.model.members[index].id());
+        let id = selection.fit.model.members[index].id();
+        vetoed.push(id);
         selection.refused.push(format!(
-            "{}: fits here, but makes the error in a file that was not fitted {:.2} times as large",
-            selection.fit.model.members[index].id(),
-            ratio
+            "{id}: fits here, but makes the error in a file that was not fitted {ratio:.2} times as large"
         ));
         selection.fit = fit::polish(bench, &without);
         selection.rename(bench);

@@ -4,7 +4,7 @@ use super::fit::{self, Fit};
 use super::flexible::{Explainable, Features};
 use super::select::{self, Selection, percent};
 use super::told::short;
-use super::workbench::Workbench;
+use super::workbench::{Member, Workbench};
 use super::{Held, intervals, jumps, rms};
 use crate::problem::Coloured;
 use crate::report::data::Verdict;
@@ -197,10 +197,7 @@ fn without_names(bench: &Workbench<'_>, selection: &mut Selection, before: Expla
     } else if let Some(strays) = strays(bench, residual).filter(|strays| strays.decide) {
         selection.decisions.push(format!(
             "No effect passes, yet {} off by more than {STRAY} times {of}, and not the others, the worst by {} {} at {} s: unknown.",
-            match strays.count {
-                1 => "one reading is".to_owned(),
-                count => format!("{count} readings are"),
-            },
+            strays.counted(),
             short(strays.largest),
             bench.problem.unit,
             short(strays.at_s),
@@ -252,6 +249,16 @@ struct Strays {
     decide: bool,
 }
 
+impl Strays {
+    /// How many there are, as the beginning of a sentence.
+    fn counted(&self) -> String {
+        match self.count {
+            1 => "one reading is".to_owned(),
+            count => format!("{count} readings are"),
+        }
+    }
+}
+
 /// Readings far beyond the stated noise, and what reference and time stamps are accurate to, if there are some.
 fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
     let stated = bench.problem.noise > 0.0;
@@ -289,13 +296,11 @@ fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
 /// What is to be said of readings that no noise makes and that nothing accounts for, where they decide nothing.
 pub(super) fn slips(read: &Workbench<'_>, shown: &Fit) -> Option<String> {
     // Behind what cuts or rounds, noise is not what the model file states.
-    let cut = shown
-        .model
-        .members
-        .iter()
-        .any(|member| member.effect.cuts());
-    let stated = read.problem.noise > 0.0 && !cut;
-    let strays = strays(read, &shown.residual).filter(|_| stated)?;
+    let cuts = |member: &Member| member.effect.cuts();
+    if read.problem.noise <= 0.0 || shown.model.members.iter().any(cuts) {
+        return None;
+    }
+    let strays = strays(read, &shown.residual)?;
     let of_what = if shown.model.members.is_empty() {
         ""
     } else {
@@ -304,10 +309,7 @@ pub(super) fn slips(read: &Workbench<'_>, shown: &Fit) -> Option<String> {
     Some(format!(
         "{}: {} off by more than {STRAY} times the stated noise{of_what}, the worst by {} {} at {} s: a slip of the log, or something too rare here to name",
         read.problem.name,
-        match strays.count {
-            1 => "one reading is".to_owned(),
-            count => format!("{count} readings are"),
-        },
+        strays.counted(),
         short(strays.largest),
         read.problem.unit,
         short(strays.at_s),
@@ -315,14 +317,14 @@ pub(super) fn slips(read: &Workbench<'_>, shown: &Fit) -> Option<String> {
 }
 
 /// The least energy that the design lets be left: what is unavoidable, or the reference's own zero.
-pub(super) fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
+fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
     let zero = bench.problem.accuracy.zero;
     unavoidable.max(zero * zero * bench.len() as f64)
 }
 
 /// By how much the mean square of the stated noise that has a memory, in the view's unit squared, can be above the stated one by
 /// chance: over T it has no more than T/τ independent values (its squares' covariance falls as the square of its own).
-pub(super) fn swing(bench: &Workbench<'_>, coloured: Coloured) -> f64 {
+fn swing(bench: &Workbench<'_>, coloured: Coloured) -> f64 {
     let span_s = match bench.t_s.as_slice() {
         [first, .., last] if last > first => last - first,
         _ => return 0.0,
@@ -348,7 +350,8 @@ pub(super) fn doubt(
         );
         return (Verdict::Unknown, None);
     }
-    if confirmed || selection.named.is_empty() {
+    // What contradicts the effects' size confirms nothing.
+    if (confirmed && not_there.is_none()) || selection.named.is_empty() {
         return (verdict, None);
     }
     let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
@@ -412,7 +415,7 @@ pub(super) fn doubt(
 
 /// Energy by which values that were found in a part of the recording miss the other part, beyond what the fit leaves; and whether
 /// that is much beside it.
-pub(super) fn carried(fit: &Fit, held: &Held) -> (f64, bool) {
+fn carried(fit: &Fit, held: &Held) -> (f64, bool) {
     let told = held.residual.iter().zip(&fit.residual);
     let (there, here) = told
         .filter(|(there, _)| there.is_finite())
@@ -423,7 +426,7 @@ pub(super) fn carried(fit: &Fit, held: &Held) -> (f64, bool) {
 }
 
 /// Energy of what is left beyond the stated noise, if that is stated well enough to tell.
-pub(super) fn beyond(bench: &Workbench<'_>, rest: f64, unavoidable: f64) -> f64 {
+fn beyond(bench: &Workbench<'_>, rest: f64, unavoidable: f64) -> f64 {
     let allowed = allowed(bench, unavoidable);
     let count = bench.len().max(1) as f64;
     let chance = select::CERTAIN * allowed * (2.0 / count).sqrt();
@@ -437,7 +440,7 @@ pub(super) fn beyond(bench: &Workbench<'_>, rest: f64, unavoidable: f64) -> f64 
 }
 
 /// Correlation of the sizes of two series.
-pub(super) fn correlation(a: &[f64], b: &[f64]) -> f64 {
+fn correlation(a: &[f64], b: &[f64]) -> f64 {
     let count = a.len().max(1) as f64;
     let mean = |series: &[f64]| series.iter().map(|v| v.abs()).sum::<f64>() / count;
     let (ma, mb) = (mean(a), mean(b));

@@ -2,7 +2,7 @@
 
 use super::{FEWEST_ROWS, Frame, battery::PACK, seconds, series::median};
 use crate::{
-    effects::{self, Stage},
+    effects::{self, Stage, scene::integral},
     failure::Failure,
     model::{Model, Sensor},
     problem::{BatteryBase, Drive, Observed, Problem, View},
@@ -429,14 +429,7 @@ pub(super) fn counter(
     source: &str,
     column: &str,
 ) -> Result<(), Failure> {
-    let mut charge_c = vec![0.0; drive.len()];
-    for rows in &drive.segments {
-        for row in rows.start + 1..rows.end {
-            let mean_a = 0.5 * (drive.reference[row - 1] + drive.reference[row]);
-            let step_s = drive.t_s[row] - drive.t_s[row - 1];
-            charge_c[row] = charge_c[row - 1] + mean_a * step_s;
-        }
-    }
+    let charge_c = integral(&drive.t_s, &drive.segments, &drive.reference, false);
     let charge = Drive {
         reference: charge_c.into(),
         ..drive.clone()

@@ -45,22 +45,12 @@ pub(super) fn later_s(observed: &Observed, reported: &Reported, rate: &[f64]) ->
             continue;
         }
         // What a line through the readings takes of either is no sign of a time.
-        let left = |of: &dyn Fn(usize) -> f64| -> Vec<f64> {
-            let count = rows.len() as f64;
-            let x = |row: usize| reported.current_a[row];
-            let (mean_x, mean) = (
-                rows.iter().map(|&row| x(row)).sum::<f64>() / count,
-                rows.iter().map(|&row| of(row)).sum::<f64>() / count,
-            );
-            let spread: f64 = rows.iter().map(|&row| (x(row) - mean_x).powi(2)).sum();
-            let together: f64 = rows
+        let left = |of: &dyn Fn(usize) -> f64| {
+            let pairs: Vec<(f64, f64)> = rows
                 .iter()
-                .map(|&row| (x(row) - mean_x) * (of(row) - mean))
-                .sum();
-            let slope = together / spread.max(f64::MIN_POSITIVE);
-            rows.iter()
-                .map(|&row| of(row) - mean - slope * (x(row) - mean_x))
-                .collect()
+                .map(|&row| (reported.current_a[row], of(row)))
+                .collect();
+            beside_line(&pairs)
         };
         let by_time = left(&|row| rate[row]);
         let off = left(&|row| observed.value[row] - reported.current_a[row]);
@@ -79,22 +69,29 @@ fn misfit(observed: &Observed, reported: &Reported) -> f64 {
             .map(|row| (reported.current_a[row], observed.value[row]))
             .filter(|(x, y)| x.is_finite() && y.is_finite())
             .collect();
-        let count = pairs.len() as f64;
         if pairs.len() < 3 {
             continue;
         }
-        let mean = |of: fn(&(f64, f64)) -> f64| pairs.iter().map(of).sum::<f64>() / count;
-        let (x, y) = (mean(|pair| pair.0), mean(|pair| pair.1));
-        let spread: f64 = pairs.iter().map(|pair| (pair.0 - x).powi(2)).sum();
-        let together: f64 = pairs.iter().map(|pair| (pair.0 - x) * (pair.1 - y)).sum();
-        let slope = if spread > 0.0 { together / spread } else { 1.0 };
-        squares.extend(
-            pairs
-                .iter()
-                .map(|pair| (pair.1 - y - slope * (pair.0 - x)).powi(2)),
-        );
+        squares.extend(beside_line(&pairs).iter().map(|left| left * left));
     }
     squares.sort_by(f64::total_cmp);
     let counted = (squares.len() as f64 * COUNTED).ceil() as usize;
     squares[..counted].iter().sum::<f64>() / counted.max(1) as f64
+}
+
+/// What a straight line through points leaves of each, by least squares.
+fn beside_line(points: &[(f64, f64)]) -> Vec<f64> {
+    let count = points.len() as f64;
+    let mean = |of: fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / count;
+    let (x, y) = (mean(|point| point.0), mean(|point| point.1));
+    let spread: f64 = points.iter().map(|point| (point.0 - x).powi(2)).sum();
+    let together: f64 = points
+        .iter()
+        .map(|point| (point.0 - x) * (point.1 - y))
+        .sum();
+    let slope = together / spread.max(f64::MIN_POSITIVE);
+    points
+        .iter()
+        .map(|point| point.1 - y - slope * (point.0 - x))
+        .collect()
 }
