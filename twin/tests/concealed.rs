@@ -205,6 +205,23 @@ fn a_zero_error_and_a_sensitivity_error() {
     );
 }
 
+/// Five hours that begin under a usual load: no sensor warms so slowly that its heat would be the same all the time.
+#[test]
+fn a_sensitivity_error_over_hours_is_no_heat() {
+    let mut truth = truth();
+    truth.t_s.iter_mut().for_each(|t| *t *= 20.0);
+    let mut next = noise(7, 60.0);
+    for steps in truth.current_a.chunks_mut(30) {
+        steps.fill(next());
+    }
+    truth.current_a[..30].fill(60.0);
+    truth.high.fill(0.0);
+    let reading = truth.current_a.iter().map(|i| 1.02 * i).collect();
+    let report = explained(&truth, reading, 41, &[]);
+    assert_named(&report, "gain", &[("gain", 1.02, 0.0005)]);
+    assert_eq!(report.verdict, Verdict::Explained, "{:?}", report.effects);
+}
+
 #[test]
 fn both_at_once() {
     let truth = truth();

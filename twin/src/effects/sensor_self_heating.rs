@@ -5,6 +5,8 @@ use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 
 /// Heat needs a second at least to reach a Hall element through its package.
 const MIN_TAU_S: f64 = 1.0;
+/// Nor does anything of the size of a sensor take longer to warm than some tens of minutes.
+const MAX_TAU_S: f64 = 3600.0;
 /// In a recording so many times shorter than τ the heat is hardly told from a gain,
 const LONG: f64 = 2.0;
 /// and so many times shorter it is one.
@@ -38,8 +40,10 @@ impl Effect for SensorSelfHeating {
             let most = 0.5 / (scale.rms * scale.rms).max(1e-12);
             (-most, most)
         } else {
-            // What is quicker is no heat.
-            ((10.0 * scale.step_s).max(MIN_TAU_S), ENDLESS * scale.span_s)
+            // What is quicker is no heat, and what is slower is a gain.
+            let least = (10.0 * scale.step_s).max(MIN_TAU_S);
+            let most = (ENDLESS * scale.span_s).min(MAX_TAU_S);
+            (least, most.max(least))
         }
     }
 
@@ -54,9 +58,11 @@ impl Effect for SensorSelfHeating {
     fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
         let small = 0.01 / (scale.rms * scale.rms).max(1e-12);
         let quickest = (20.0 * scale.step_s).max(2.0 * MIN_TAU_S);
-        spaced(quickest, (0.5 * scale.span_s).max(2.0 * quickest), 6)
+        let slow = (0.5 * scale.span_s).min(0.5 * MAX_TAU_S);
+        let slowest = (0.5 * ENDLESS * scale.span_s).min(MAX_TAU_S);
+        spaced(quickest, slow.max(2.0 * quickest), 6)
             .into_iter()
-            .chain([0.5 * ENDLESS * scale.span_s])
+            .chain([slowest])
             .map(|tau| vec![small, tau])
             .collect()
     }
