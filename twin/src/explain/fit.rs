@@ -1,6 +1,7 @@
 //! Robust least squares for the values of a model: Levenberg–Marquardt on Huber's loss, bounds kept, steps searched.
 
 use std::cmp::Ordering;
+use std::collections::HashSet;
 use std::sync::{Arc, OnceLock};
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
@@ -859,6 +860,8 @@ impl Stepping<'_, '_, '_> {
         let chance = effect.choices(&bench.scale).max(1.0).ln();
         let from = if again { COARSE } else { 0 };
         let mut found = false;
+        // Some of what lies near is the same at every share; the cost only falls, so that what lost once loses again.
+        let mut tried_before: HashSet<Vec<u64>> = HashSet::new();
         for (tried, share) in TOGETHER.into_iter().enumerate().skip(from) {
             // What is no better than chance after the coarse steps is not near a minimum that is.
             if tried >= COARSE && self.cost > idle - chance {
@@ -875,7 +878,8 @@ impl Stepping<'_, '_, '_> {
                     if let Some((_, p)) = held {
                         values[p] = self.values()[p];
                     }
-                    found |= self.goes_to(values).is_lt();
+                    let key = values.iter().map(|value| value.to_bits()).collect();
+                    found |= tried_before.insert(key) && self.goes_to(values).is_lt();
                 }
                 if before - self.cost < WORTH {
                     break;
