@@ -453,6 +453,7 @@ impl<'a> Work<'a> {
                 zero: sensor.accuracy.zero,
                 gain: sensor.accuracy.gain,
                 // The width, to either side.
+                scatter: 0.0,
                 moment_s: 0.5 * slack_s,
             },
         };

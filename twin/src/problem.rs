@@ -163,6 +163,8 @@ pub struct Observed {
     pub on_drive_rows: bool,
     /// Time between two new readings, in s, where readings repeat though the design says that each is new; else 0.
     pub held_s: f64,
+    /// Step of the grid on which readings lie and to which the simulation does not round, in the view's unit; 0 if there is none.
+    pub grid: f64,
 }
 
 impl Observed {
@@ -173,6 +175,7 @@ impl Observed {
             stretches: Stretches::one(value.len()),
             on_drive_rows: true,
             held_s: 0.0,
+            grid: 0.0,
             t_s: t_s.into(),
             value,
         }
@@ -273,13 +276,15 @@ pub struct Coloured {
     pub tau_s: f64,
 }
 
-/// Accuracy of an instrument, and of when it was read: `zero + gain·abs(reading) + moment·abs(d reading/dt)`.
+/// Accuracy of an instrument, and of when it was read: `zero + (gain + scatter)·abs(reading) + moment·abs(d reading/dt)`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Accuracy {
     /// Constant part, in the view's unit.
     pub zero: f64,
     /// Share of the reading.
     pub gain: f64,
+    /// Share of the reading by which each is off by itself, and not all alike.
+    pub scatter: f64,
     /// Time by which the moments of readings may all be off, in s.
     pub moment_s: f64,
 }
@@ -287,7 +292,7 @@ pub struct Accuracy {
 impl Accuracy {
     /// By how much a reading may be off that changes by `slope_per_s` in a second, in the view's unit.
     pub fn at(self, reading: f64, slope_per_s: f64) -> f64 {
-        self.zero + self.gain * reading.abs() + self.moment_s * slope_per_s.abs()
+        self.zero + (self.gain + self.scatter) * reading.abs() + self.moment_s * slope_per_s.abs()
     }
 }
 

@@ -81,7 +81,7 @@ const OFF: f64 = 0.2;
 const LANES: usize = 8;
 
 /// Steps of a grid on which nearly all readings lie; usually one or none.
-fn lattice(observed: &[f64]) -> Vec<f64> {
+pub(crate) fn lattice(observed: &[f64]) -> Vec<f64> {
     let mut sorted: Vec<f64> = observed
         .iter()
         .copied()

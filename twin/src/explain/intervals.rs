@@ -7,7 +7,10 @@
 //!   freedom as stretches tell the value (Bell and McCaffrey 2002). It holds for noise of any colour that is short against a
 //!   stretch, and for a model that is a little wrong.
 //! - *By the stated noise*: the fit's own weights carried through the noise that the model file states, its memory with it; where
-//!   none is stated, through white noise as loud as what is left. A memory as long as the recording shows in no stretch.
+//!   none is stated, through white noise as loud as what is left. A memory as long as the recording shows in no stretch, nor does
+//!   what rounding takes from readings that stay.
+//!
+//! What the model file says of the reference's accuracy is added in quadrature: as far as its zero and its gain move the value.
 //!
 //! Where the loss has a kink in a value (an effect says so, [`crate::effects::Effect::kinked`]) or jumps with it, neither holds:
 //! the value is moved, the others are fitted again, and the interval ends where the loss has risen by what bounds 95 %
@@ -156,6 +159,9 @@ fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope, beside: f64) -> Ce
         .map(|(r, w)| (r * w * fit.sigma * fit.sigma).powi(2))
         .sum();
     let variance = limited / (rows - size as f64).max(1.0);
+    let accuracy = bench.problem.accuracy;
+    let ones = bench.as_fitted(vec![1.0; bench.len()]);
+    let as_designed = bench.as_fitted(bench.plain.clone());
     let (mut half, mut inflation) = (Vec::with_capacity(size), Vec::with_capacity(size));
     for k in 0..size {
         let influence: Vec<f64> = (0..fit.residual.len())
@@ -170,7 +176,7 @@ fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope, beside: f64) -> Ce
             })
             .collect();
         let white = variance * influence.iter().map(|a| a * a).sum::<f64>();
-        let by_noise = bench.carried(0, &influence).unwrap_or(white);
+        let by_noise = bench.carried(0, &influence).unwrap_or(white) + bench.rounded(0, &influence);
         // What the model file says of the base is as uncertain as it says.
         let by_base: f64 = (0..size)
             .map(|j| inverted[(k, j)].powi(2) * stated[(j, j)])
@@ -184,7 +190,10 @@ fn certainty(bench: &Workbench<'_>, fit: &Fit, slope: &Slope, beside: f64) -> Ce
             times = times.max(by_stretches[k] / white.max(1e-300));
         }
         let along = beside / (fit.sigma * fit.sigma) * inverted[(k, k)];
-        half.push(most.hypot(along.sqrt()));
+        // The reference's own zero and gain are the same all the time, and no noise shows them.
+        let by_zero = accuracy.zero * dot(&influence, &ones);
+        let by_gain = accuracy.gain * dot(&influence, &as_designed);
+        half.push(most.hypot(along.sqrt()).hypot(by_zero).hypot(by_gain));
         inflation.push(times.max(1.0));
     }
     Certainty { half, inflation }
@@ -240,7 +249,8 @@ pub fn variations(bench: &Workbench<'_>, fit: &Fit) -> Vec<Variation> {
                         let column = &slope.columns[k][rows.clone()];
                         let weighted = column.iter().zip(&weights[rows.clone()]);
                         let weighted: Vec<f64> = weighted.map(|(c, w)| c * w).collect();
-                        let stated = bench.carried(rows.start, &weighted).unwrap_or(0.0);
+                        let stated = bench.carried(rows.start, &weighted).unwrap_or(0.0)
+                            + bench.rounded(rows.start, &weighted);
                         (remembered * loudness).max(stated / matrix[(k, k)])
                     })
                     .sum();

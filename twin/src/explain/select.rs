@@ -596,7 +596,7 @@ fn small(
     let deviations = bench.deviations(&change);
     if deviations < CERTAIN {
         return Some(format!(
-            "{deviations:.1} standard deviations of what the stated noise does by itself"
+            "{deviations:.1} standard deviations of what the stated noise and the readings' steps do by themselves"
         ));
     }
     let noise = to / rows;
@@ -1155,7 +1155,8 @@ pub fn beaten(bench: &Workbench<'_>, other: &Fit, chosen: &Fit) -> bool {
         differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
     // Noise with a memory tells two models apart by no more than what it does along their difference, however many the rows.
     let apart = change(&other.predicted, &chosen.predicted);
-    let stated = bench.carried(0, &apart).unwrap_or(0.0).sqrt() / (sigma * sigma * count);
+    let stated = bench.carried(0, &apart).unwrap_or(0.0) + bench.rounded(0, &apart);
+    let stated = stated.sqrt() / (sigma * sigma * count);
     mean > BEATEN * (variance / count).sqrt().max(stated)
 }
 

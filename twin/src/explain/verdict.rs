@@ -144,8 +144,8 @@ pub(super) fn judge(
 fn without_names(bench: &Workbench<'_>, selection: &mut Selection, before: Explainable) -> Verdict {
     let noise = bench.problem.noise;
     let known = noise.max(bench.problem.accuracy.zero);
-    // What the reference is not accurate to is no mismatch.
-    let inaccurate: Vec<f64> = (0..bench.len()).map(|row| bench.accuracy(row)).collect();
+    // What the reference is not accurate to, or rounding takes, is no mismatch.
+    let inaccurate: Vec<f64> = (0..bench.len()).map(|row| bench.inaccuracy(row)).collect();
     let beyond = |residual: &[f64]| -> Vec<f64> {
         let pairs = residual.iter().zip(&inaccurate);
         pairs.map(|(r, by)| (r.abs() - by).max(0.0)).collect()
@@ -274,7 +274,7 @@ fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
         return None;
     }
     let rows: Vec<usize> = (0..bench.len())
-        .filter(|&row| residual[row].abs() > STRAY * noise + bench.accuracy(row))
+        .filter(|&row| residual[row].abs() > STRAY * noise + bench.inaccuracy(row))
         .collect();
     let largest = *rows
         .iter()
@@ -316,9 +316,9 @@ pub(super) fn slips(read: &Workbench<'_>, shown: &Fit) -> Option<String> {
     ))
 }
 
-/// The least energy that the design lets be left: what is unavoidable, or the reference's own zero.
+/// The least energy that the design lets be left: what is unavoidable, or the reference's own zero and the readings' steps.
 fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
-    let zero = bench.problem.accuracy.zero;
+    let zero = bench.problem.accuracy.zero + 0.5 * bench.problem.observed.grid;
     unavoidable.max(zero * zero * bench.len() as f64)
 }
 

@@ -399,12 +399,42 @@ impl<'a> Workbench<'a> {
         Some(self.problem.noise.powi(2) * energy + 2.0 * coloured.rms.powi(2) * together)
     }
 
-    /// How many standard deviations a fitted change is away from what the stated noise does by itself: its projection on the
-    /// change has the variance `cᵀΣc`. Infinite if none is stated.
+    /// Variance of a weighted sum of readings from a row on that comes of their grid. What rounding takes has a twelfth of the step
+    /// squared, less what noise evens out that is louder than that (Widrow and Kollár 2008, Quantization Noise, ch. 4 and 19), and is
+    /// the same for as long as the signal stays within half a step.
+    pub fn rounded(&self, from: usize, weights: &[f64]) -> f64 {
+        let step = self.problem.observed.grid;
+        if step <= 0.0 {
+            return 0.0;
+        }
+        let own = step * step / 12.0;
+        let beside = (self.problem.noise.powi(2) - own).max(0.0) / (step * step);
+        let left = own * (-4.0 * std::f64::consts::PI.powi(2) * beside).exp();
+        let (mut squares, mut together) = (0.0, 0.0);
+        let mut began = f64::NAN;
+        for (value, a) in self.plain[from..].iter().zip(weights) {
+            if (value - began).abs() <= 0.5 * step {
+                together += a;
+            } else {
+                squares += f64::powi(together, 2);
+                (together, began) = (*a, *value);
+            }
+        }
+        left * (squares + together * together)
+    }
+
+    /// How many standard deviations a fitted change is away from what the stated noise, and the readings' grid, do by themselves: its
+    /// projection on the change has the variance `cᵀΣc`. Infinite if there is neither.
     pub fn deviations(&self, change: &[f64]) -> f64 {
         let energy: f64 = change.iter().map(|c| c * c).sum();
         let white = self.problem.noise.powi(2) * energy;
-        energy / self.carried(0, change).unwrap_or(white).sqrt()
+        let noise = self.carried(0, change).unwrap_or(white);
+        energy / (noise + self.rounded(0, change)).sqrt()
+    }
+
+    /// By how much reference and time stamps, and the readings' grid, may put a reading off at a row, in the view's unit.
+    pub fn inaccuracy(&self, row: usize) -> f64 {
+        self.accuracy(row) + 0.5 * self.problem.observed.grid
     }
 
     /// The simulation at the rows that count.

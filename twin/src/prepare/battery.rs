@@ -4,10 +4,14 @@ use std::sync::Arc;
 
 use super::{Item, Purpose, Work, checks, held::Freshness, series};
 use crate::{
-    effects::scene::{gap_ah, mean_flow},
+    effects::{
+        quantisation::lattice,
+        scene::{gap_ah, mean_flow},
+    },
     failure::Failure,
     model::Battery,
     problem::{Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, View},
+    report::format::at_most,
     simulate::board::Pace,
 };
 
@@ -65,7 +69,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
     let mut items = Vec::new();
     for (view, name) in views {
         let value = work.frame.column(name);
-        let (observed, rows) = match &value {
+        let (mut observed, rows) = match &value {
             Some(value) => {
                 checks::some_values(value, name, work.frame.source())?;
                 if work.purpose == Purpose::Compare {
@@ -75,6 +79,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             }
             None => (series::every_row(&drive), Arc::clone(&parts.rows)),
         };
+        observed.grid = grid(work, name, &observed);
         let cells = if name == PACK {
             f64::from(battery.cells)
         } else {
@@ -136,6 +141,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
                 accuracy: Accuracy {
                     zero: accuracy.zero,
                     gain: accuracy.gain,
+                    scatter: 0.0,
                     moment_s: 0.0,
                 },
             },
@@ -145,6 +151,21 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
         });
     }
     Ok(items)
+}
+
+/// Step of the grid on which the readings lie, 0 if there is none.
+fn grid(work: &mut Work<'_>, name: &str, observed: &Observed) -> f64 {
+    let read = observed.value.iter().zip(&observed.valid);
+    let read: Vec<f64> = read.filter(|(_, valid)| **valid).map(|(y, _)| *y).collect();
+    let Some(step) = lattice(&read).first().copied() else {
+        return 0.0;
+    };
+    let unit = recording::name::unit(name).unwrap_or("1");
+    work.remark(format!(
+        "{name} is read in steps of {} {unit}: what rounding takes from a reading stays as long as the reading does, and counts once",
+        at_most(step, 4)
+    ));
+    step
 }
 
 /// What of the battery is there and yet not compared.

@@ -124,9 +124,10 @@ pub(super) fn item(
         coloured: Coloured::default(),
         accuracy: Accuracy {
             zero: sensor.accuracy.zero,
+            gain: sensor.accuracy.gain,
             // What an uncertain moment moves a difference by is no physics either: two moments, each even over its width,
             // √2·width/√12.
-            gain: sensor.accuracy.gain + spec.jitter_s / 6f64.sqrt() / spacing_s,
+            scatter: spec.jitter_s / 6f64.sqrt() / spacing_s,
             moment_s: 0.0,
         },
     };

@@ -112,6 +112,7 @@ pub(super) fn drive_rows(
         stretches: stretches(drive),
         on_drive_rows: true,
         held_s: 0.0,
+        grid: 0.0,
     };
     (observed, Arc::clone(rows))
 }
@@ -125,6 +126,7 @@ pub(super) fn every_row(drive: &Drive) -> Observed {
         stretches: stretches(drive),
         on_drive_rows: true,
         held_s: 0.0,
+        grid: 0.0,
     }
 }
 
