@@ -1161,7 +1161,7 @@ impl Measurement {
             (Code::ZeroDriftBeyondLimit, self.zero_beyond_limit),
             (
                 Code::SocUncertain,
-                self.soc_reading.uncertainty > SOC_UNCERTAINTY_LIMIT,
+                self.soc_reading.presented_uncertainty() > SOC_UNCERTAINTY_LIMIT,
             ),
             (Code::CellVoltageMissing, !self.vehicle.voltage_fresh),
             (Code::VehicleStateMissing, !self.vehicle.state_fresh),
@@ -1277,7 +1277,7 @@ impl Measurement {
         can::StateOfCharge {
             state_of_charge: self.soc_reading.presented,
             validity: self.soc_validity(),
-            uncertainty: known.then_some(self.soc_reading.uncertainty),
+            uncertainty: known.then(|| self.soc_reading.presented_uncertainty()),
             remaining: known.then_some(self.soc_reading.remaining),
         }
     }
@@ -1426,7 +1426,7 @@ impl Measurement {
             (readings.channel_difference, readings.channel_bound) = (difference, bound);
         }
         readings.soc = self.soc_reading.presented;
-        readings.soc_uncertainty = self.soc_reading.uncertainty;
+        readings.soc_uncertainty = self.soc_reading.presented_uncertainty();
         readings.soc_validity = self.soc_validity();
         readings.remaining_charge = self.soc_reading.remaining;
         readings.soc_anchors = self.soc_reading.anchors;

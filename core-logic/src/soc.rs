@@ -23,7 +23,7 @@
 //! there before).
 //!
 //! **On the bus.** The estimate moves at once, the presented value follows it by at most
-//! [`SocConfig::presented_slew_ppm_per_s`]. Only the very first anchor is presented at once: until then the state of
+//! [`SocConfig::presented_slew_ppm_per_s`]; what is between them is added to the half-width that goes out. Only the very first anchor is presented at once: until then the state of
 //! charge is marked as not known.
 
 use serde::{Deserialize, Serialize};
@@ -281,6 +281,16 @@ pub struct SocReading {
     pub discharged: Nanocoulombs,
     /// Jumps of the counter that no charge can make (differences beyond 64 bits), since the start.
     pub counter_jumps: u32,
+}
+
+impl SocReading {
+    /// Half-width of [`SocReading::presented`]: while it follows the estimate its distance counts too.
+    #[must_use]
+    pub fn presented_uncertainty(&self) -> Ppm {
+        let distance = self.presented.get().abs_diff(self.estimate.get());
+        let half_width = self.uncertainty.get().saturating_add_unsigned(distance);
+        Ppm(half_width.min(Ppm::ONE.get()))
+    }
 }
 
 /// What an update did beyond integrating.

@@ -1116,6 +1116,41 @@ fn a_mean_that_moves_by_other_factors_makes_no_converter_stuck() {
     assert!(bench.has(Code::ConverterStuck));
 }
 
+/// After an anchor the presented value is still far from the estimate: what is sent with it covers the estimate's interval.
+#[test]
+fn what_is_presented_is_within_its_uncertainty_of_the_estimate() {
+    let mut bench = Bench::new(Configuration::default());
+    bench
+        .measurement
+        .set_state_of_charge(Ppm(500_000), Ppm(400_000));
+    let capacity = bench.configuration.soc.capacity_mah;
+    let share = |charge: Nanocoulombs| charge.get() as f64 / (f64::from(capacity) * 3.6e9) * 1e6;
+    let mut farthest = 0.0_f64;
+    for _ in 0..2_500 {
+        bench.measurement.on_battery_voltage(
+            &BatteryVoltage {
+                cell: Some(Microvolts::from_millivolts(4_000)),
+                pack: None,
+                cell_temperature: None,
+            },
+            Instant::from_ticks(bench.now),
+        );
+        bench.run_ms(1_000);
+        let sent = bench.measurement.state_of_charge();
+        let kept = bench.measurement.retained(0).soc;
+        let distance = (share(kept.remaining) - f64::from(sent.state_of_charge.get())).abs();
+        farthest = farthest.max(distance);
+        let half_width = f64::from(sent.uncertainty.unwrap().get());
+        assert!(
+            half_width + 3.0 >= distance + share(kept.uncertainty),
+            "{half_width} ppm at {distance} ppm"
+        );
+        let readings = bench.readings();
+        assert_eq!(Some(readings.soc_uncertainty), sent.uncertainty);
+    }
+    assert!(farthest > 100_000.0, "{farthest}");
+}
+
 /// With the small sensor open the large one is right at any current: no contradiction to the flag.
 #[test]
 fn the_large_sensor_in_the_small_ones_place_is_no_implausible_flag() {
