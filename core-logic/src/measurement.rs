@@ -251,6 +251,8 @@ pub struct Measurement {
     conversions: u32,
     invalid_conversions: u32,
     refused_steps: u32,
+    /// The newest conversion was refused for its rate of change.
+    rate_refused: bool,
     reading: CurrentReading,
     average: SlidingAverage,
     open_sensor: OpenSensor,
@@ -457,6 +459,7 @@ impl Measurement {
             conversions: 0,
             invalid_conversions: 0,
             refused_steps: 0,
+            rate_refused: false,
             reading: Converter::new().reading(&prepared.converter, now),
             average: SlidingAverage::new(),
             open_sensor: OpenSensor::new(),
@@ -747,7 +750,6 @@ impl Measurement {
         let conditions = self.conditions(configuration).union(external);
         let changes = self.diagnosis.step(now, conditions);
         self.effects = self.diagnosis.effects();
-        self.refused_steps = self.converter.counters().steps_refused;
         Tick {
             hv_permit: self.key_outputs.hv_permit,
             changes,
@@ -934,6 +936,9 @@ impl Measurement {
         self.history = *history;
         self.reading = reading;
         self.conversions = self.conversions.wrapping_add(1);
+        // Kept with the reading: it stands for several ticks.
+        let refused = self.converter.counters().steps_refused;
+        self.rate_refused = core::mem::replace(&mut self.refused_steps, refused) != refused;
         if !reading.validity.is_valid() {
             self.invalid_conversions = self.invalid_conversions.saturating_add(1);
         }
@@ -1102,9 +1107,8 @@ impl Measurement {
         let too_hot_or_cold = |temperature: Option<MilliCelsius>| {
             temperature.is_some_and(|temperature| !(lowest..=highest).contains(&temperature))
         };
-        let counters = self.converter.counters();
         let implausible = self.reading.validity.contains(Validity::IMPLAUSIBLE);
-        let by_rate = implausible && counters.steps_refused != self.refused_steps;
+        let by_rate = implausible && self.rate_refused;
         let has_no_relations = matches!(
             configuration.front_end,
             FrontEnd::ClosedLoop(sensor) if sensor.relations == SupplyRelations::default()

@@ -1151,6 +1151,25 @@ fn what_is_presented_is_within_its_uncertainty_of_the_estimate() {
     assert!(farthest > 100_000.0, "{farthest}");
 }
 
+/// One refused step: a rate, not a converter that is stuck, for as long as its reading is the newest.
+#[test]
+fn a_refused_step_is_not_called_stuck() {
+    let mut bench = Bench::new(with_front_end(FrontEnd::Hah1bv(Hah1bv::default())));
+    bench.run_ms(1_500);
+    assert!(bench.measurement.current().validity.is_valid());
+    // 400 A within one conversion.
+    bench.code += 2_622;
+    let mut named = false;
+    for _ in 0..50 {
+        bench.run_ms(10);
+        named |= bench.has(Code::RateImplausible);
+        assert!(!bench.has(Code::ConverterStuck), "{} us", bench.now);
+    }
+    assert!(named);
+    // Two conversions, and the 100 ms that the row keeps it.
+    assert!(bench.measurement.current().validity.is_valid());
+}
+
 /// With the small sensor open the large one is right at any current: no contradiction to the flag.
 #[test]
 fn the_large_sensor_in_the_small_ones_place_is_no_implausible_flag() {
