@@ -662,17 +662,19 @@ impl Measurement {
             self.soc.declare_loss(&self.prepared.soc, doubt);
         }
         let now = report.at.unwrap_or(self.now);
+        // No rest by a current that is doubted, nor against the other channel. (A calibration doubts none at rest.)
+        let rest_current = configuration.soc.rest_current;
+        let is_known = self.reading.validity.and(self.effects.current).is_valid()
+            && self
+                .meter_mean()
+                .is_none_or(|mean| mean.saturating_abs() <= rest_current);
         self.soc.update(
             &self.prepared.soc,
             &configuration.ocv,
             &SocInput {
                 now,
                 charge_total: report.charge_total,
-                current: self
-                    .reading
-                    .validity
-                    .is_valid()
-                    .then_some(self.reading.current),
+                current: is_known.then_some(self.reading.current),
                 cell_voltage: self.cell_voltage,
             },
         );

@@ -1170,6 +1170,34 @@ fn a_refused_step_is_not_called_stuck() {
     assert!(bench.measurement.current().validity.is_valid());
 }
 
+/// The current is known to be wrong, or the meter sees one: no rest, whatever the converter reads.
+#[test]
+fn no_anchor_while_the_current_is_known_to_be_wrong() {
+    for (amps, anchors) in [(0, 1), (20, 0)] {
+        let mut bench = Bench::new(Configuration::default());
+        bench
+            .measurement
+            .set_state_of_charge(Ppm(500_000), Ppm(150_000));
+        bench.report.mean_current = Microamps::from_amps(amps);
+        for _ in 0..2_000 {
+            bench.measurement.on_battery_voltage(
+                &BatteryVoltage {
+                    cell: Some(Microvolts::from_millivolts(4_000)),
+                    pack: None,
+                    cell_temperature: None,
+                },
+                Instant::from_ticks(bench.now),
+            );
+            // The meter counts on, the converter stands at 0 A: its last bit moves.
+            bench.code ^= 1;
+            let counted = Nanocoulombs::from_coulombs(i64::from(amps));
+            bench.report.charge_total = bench.report.charge_total.saturating_add(counted);
+            bench.run_ms(1_000);
+        }
+        assert_eq!(bench.readings().soc_anchors, anchors, "{amps} A");
+    }
+}
+
 /// With the small sensor open the large one is right at any current: no contradiction to the flag.
 #[test]
 fn the_large_sensor_in_the_small_ones_place_is_no_implausible_flag() {
