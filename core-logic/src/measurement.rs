@@ -1202,9 +1202,16 @@ impl Measurement {
         self.meter_causes.and(self.effects.charge)
     }
 
+    /// It follows the meter: what is missing there is missing here. Before the meter's first reading what was restored
+    /// stands.
     fn soc_validity(&self) -> Validity {
+        let of_meter = match self.meter.at {
+            Some(_) => self.meter_causes.without(Validity::CALIBRATING),
+            None => Validity::VALID,
+        };
         self.effects
             .soc
+            .and(of_meter)
             .and_if(!self.soc_reading.known, Validity::STALE)
     }
 

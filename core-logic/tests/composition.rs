@@ -1198,6 +1198,36 @@ fn no_anchor_while_the_current_is_known_to_be_wrong() {
     }
 }
 
+/// What the charge is doubted for by the meter's owner, the state of charge that follows it is as well.
+#[test]
+fn a_stale_meter_makes_the_state_of_charge_stale() {
+    let mut bench = Bench::new(Configuration::default());
+    bench
+        .measurement
+        .set_state_of_charge(Ppm(500_000), Ppm(20_000));
+    let validity = |bench: &Bench| bench.measurement.state_of_charge().validity;
+    // Not before the meter was read: what was restored stands.
+    let report = MeterReport {
+        at: None,
+        ..bench.report
+    };
+    let causes = Validity::STALE.and(Validity::CALIBRATING);
+    bench
+        .measurement
+        .on_meter(&bench.configuration, &report, causes);
+    assert!(validity(&bench).is_valid());
+    bench.run_ms(1_000);
+    assert!(validity(&bench).is_valid());
+    for cause in [Validity::STALE, Validity::CHIP_FAULT] {
+        bench
+            .measurement
+            .on_meter(&bench.configuration, &bench.report, cause);
+        assert_eq!(validity(&bench), cause);
+    }
+    bench.run_ms(20);
+    assert!(validity(&bench).is_valid());
+}
+
 /// With the small sensor open the large one is right at any current: no contradiction to the flag.
 #[test]
 fn the_large_sensor_in_the_small_ones_place_is_no_implausible_flag() {
