@@ -420,6 +420,9 @@ impl Soc {
         ] {
             charge.0 = mul_div(charge.get(), new.capacity, old.capacity);
         }
+        self.anchored_at = self
+            .anchored_at
+            .map(|after| mul_div(after, new.capacity, old.capacity));
     }
 
     /// Integrates up to `input.now`, and once a second looks after uncertainty and rest.
@@ -1387,6 +1390,14 @@ mod tests {
         assert!((after.presented.get() - before.presented.get()).abs() <= 1);
         assert!((after.uncertainty.get() - before.uncertainty.get()).abs() <= 1);
         assert_eq!(after.remaining.get(), before.remaining.get() / 5 * 4);
+        // Of the same share, the uncertainty has not doubled: no second anchor within this rest.
+        bench.coefficients = SocCoefficients::new(&SocConfig {
+            capacity_mah: 1_000_000,
+            ..config()
+        });
+        bench.soc.change_capacity(&aged, &bench.coefficients);
+        bench.rest(600);
+        assert_eq!(bench.reading().anchors, before.anchors);
     }
 
     #[test]
