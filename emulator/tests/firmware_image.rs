@@ -209,6 +209,29 @@ fn key_factors_that_a_client_sets_are_used() {
     assert!((back_a - before_a).abs() < 0.05, "{before_a} {back_a}");
 }
 
+/// Over a loss of power those that were saved: not what the charge's record had before the save, nor what came after it.
+#[test]
+fn key_factors_that_were_saved_are_in_force_after_a_loss_of_power() {
+    const FACTOR_K: u16 = 0x0420;
+    let firmware = firmware();
+    let parked = Row::at_rest(0.0).with_key(Key::Off);
+    let scenario = Scenario::steady(parked, Contactors::Permitted);
+    let mut rig = Rig::new(&firmware, Setup::nominal(scenario)).unwrap();
+    rig.run_s(1.5).unwrap();
+    assert_eq!(set(&mut rig, FACTOR_K, &words_of(1_020_000_000)), Ok(()));
+    assert_eq!(set(&mut rig, 0x0000, &[0x5A07]), Ok(()));
+    rig.run_s(0.5).unwrap();
+    for _ in 0..2 {
+        rig.power_cycle();
+        rig.view = Default::default();
+        rig.run_s(1.0).unwrap();
+        assert_eq!(settings(&mut rig, FACTOR_K, 2), words_of(1_020_000_000));
+        // Not saved.
+        assert_eq!(set(&mut rig, FACTOR_K, &words_of(1_030_000_000)), Ok(()));
+        rig.run_s(0.5).unwrap();
+    }
+}
+
 /// 25 °C is too warm when the limit is 10 °C.
 #[test]
 fn temperature_limits_that_a_client_sets_are_used() {

@@ -55,7 +55,7 @@ mod app {
         meter::{MeterChannel, MeterReport},
         modbus::{Command, CommandState, Event, Readings},
         modbus_rtu::Server,
-        retained::{RetainSlots, RetainedState, SavePolicy, SavePolicyConfig, Slot},
+        retained::{RetainSlots, RetainedState, SavePolicy, Slot},
         storm::StormConfig,
         units::{Duration, Instant, Nanocoulombs, elapsed},
     };
@@ -868,7 +868,7 @@ mod app {
             }
             *administration.store.active()
         });
-        let start = retained_state(cx.local.previous, &state, &configuration.save_policy);
+        let start = retained_state(cx.local.previous, &state, &configuration);
         // The next start must not find nothing, nor what is older than this one's.
         let mut first_save = !start.is_in_flash;
         let charge = start.state.map(|state| state.charge_total);
@@ -979,12 +979,13 @@ mod app {
         is_refused: bool,
     }
 
-    /// The slots' state, else the one of the flash, which `policy` wrote.
+    /// The slots' state, else the one of the flash, which the policy of `configuration` wrote.
     fn retained_state(
         previous: &Previous,
         stored: &Stored<RetainedState>,
-        policy: &SavePolicyConfig,
+        configuration: &Configuration,
     ) -> Start {
+        let policy = &configuration.save_policy;
         let mut start = Start {
             state: None,
             slots: RetainSlots::empty(),
@@ -1002,7 +1003,11 @@ mod app {
                 start.loss = identity::loss_over_reset(previous, policy);
             }
             (Err(_), Stored::Value(state) | Stored::Older(state)) => {
-                start.state = Some(*state);
+                start.state = Some(RetainedState {
+                    // It may be older than the last "save": what was saved is in force.
+                    key_factors: configuration.key_factors,
+                    ..*state
+                });
                 start.loss = identity::loss_over_power_off(policy);
                 if matches!(stored, Stored::Older(_)) {
                     // A save interval more.
