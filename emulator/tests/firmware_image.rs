@@ -232,6 +232,22 @@ fn key_factors_that_were_saved_are_in_force_after_a_loss_of_power() {
     }
 }
 
+/// Not at the factory's address either, which may be another one's on the line.
+#[test]
+fn nobody_is_answered_before_the_configuration_is_loaded() {
+    let firmware = firmware();
+    let mut rig = Rig::new(&firmware, driving(0.0)).unwrap();
+    rig.run_s(0.5).unwrap();
+    assert_eq!(set(&mut rig, 0x0900, &[7]), Ok(()));
+    let ask = |rig: &mut Rig<'_>, address: u8| rig.modbus(&[address, 4, 0, 0x28, 0, 4]);
+    assert!(rig.modbus(&[7, 6, 0, 0, 0x5A, 0x07]).is_ok());
+    rig.run_s(0.5).unwrap();
+    rig.power_cycle();
+    rig.run_for(Ticks::from_millis(5)).unwrap();
+    assert!(ask(&mut rig, 1).is_err());
+    assert!(ask(&mut rig, 7).is_ok());
+}
+
 /// 25 °C is too warm when the limit is 10 °C.
 #[test]
 fn temperature_limits_that_a_client_sets_are_used() {

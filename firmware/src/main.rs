@@ -227,9 +227,8 @@ mod app {
             storage: Storage::new(board.flash_spi),
             previous,
         };
-        // The queues are empty: both take one.
+        // The queue is empty: it takes one.
         let _ = storage::spawn();
-        let _ = rs485::spawn();
         retain::note_stage(Stage::Running);
         (shared, local)
     }
@@ -259,9 +258,7 @@ mod app {
         let mut noted = 0;
         let mut all = false;
         let start = time::now();
-        for task in [Task::Storage, Task::Rs485] {
-            check_in.enable(task, start);
-        }
+        check_in.enable(Task::Storage, start);
         let mut looked = time::micros();
         loop {
             // Every interrupt ends the sleep, a thousand of them a second; who is late is late by more than this.
@@ -638,6 +635,8 @@ mod app {
         let Some(mut wake) = RS485_WAKE.try_take_reader() else {
             return;
         };
+        // Nobody waits any more for an answer to what came before the start.
+        while cx.local.characters_out.dequeue().is_some() {}
         let mut server = Server::new(time::now());
         let mut last_command = 0;
         let mut errors = 0;
@@ -911,6 +910,8 @@ mod app {
         let _ = meter_owner::spawn(charge, now);
         let _ = conversion::spawn();
         let _ = tick::spawn();
+        // Not before its address and what it would change are loaded.
+        let _ = rs485::spawn();
 
         let mut policy = SavePolicy::new(now, charge.unwrap_or(Nanocoulombs::ZERO));
         let mut since_log_ms = 0;
