@@ -271,9 +271,10 @@ impl StateOfCharge {
     pub fn encode(&self, counter: u8) -> Frame {
         use layout::state_of_charge as at;
         let percent_hundredths = div_round(i64::from(self.state_of_charge.get()), 100);
+        // A bound is rounded up.
         let uncertainty = self
             .uncertainty
-            .map(|ppm| div_round(i64::from(ppm.get()), 1_000));
+            .map(|ppm| div_round(i64::from(ppm.get()) + 499, 1_000));
         // 0.1 Ah = 360 C
         let remaining = self
             .remaining
@@ -1123,6 +1124,22 @@ mod tests {
             ),
             (6_544, 13)
         );
+        // A half-width is rounded up: 0.04 % is not 0.
+        for (ppm, tenths) in [
+            (0, 0),
+            (1, 1),
+            (400, 1),
+            (1_000, 1),
+            (1_001, 2),
+            (1_000_000, 1_000),
+        ] {
+            let frame = StateOfCharge {
+                uncertainty: Some(Ppm(ppm)),
+                ..soc
+            }
+            .encode(0);
+            assert_eq!(raw(frame, "StateOfChargeUncertainty"), tenths, "{ppm} ppm");
+        }
         assert_eq!(
             (
                 raw(frame, "RemainingCharge"),

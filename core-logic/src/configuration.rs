@@ -688,6 +688,14 @@ mod tests {
     }
 
     #[test]
+    fn no_interval_waits_until_the_meter_is_stale() {
+        // Stale after 100 ms; the reading that ends the wait comes up to a poll later.
+        let poll_us = crate::design_parameters::METER_POLL_MS * 1_000;
+        let (_, longest_us) = field(0x0514).limits();
+        assert!(longest_us + i64::try_from(poll_us).unwrap() <= 100_000);
+    }
+
+    #[test]
     fn the_factory_s_configuration_is_valid_with_every_front_end() {
         for front_end in 0..4 {
             let mut configuration = Configuration::default();

@@ -152,8 +152,9 @@ pub struct Receiver {
 impl Receiver {
     /// Checks a frame; `Ok` carries the number of frames lost before it.
     ///
-    /// The first frame, and the first after a time-out, is accepted with any counter. After a wrong sequence the
-    /// received counter is the new reference, so the next frame in order is accepted again.
+    /// The first frame is accepted with any counter, the first after a time-out with any but the last one's: a sender that
+    /// repeats one frame stays silent for us. After a wrong sequence the received counter is the new reference, so the
+    /// next frame in order is accepted again.
     ///
     /// # Errors
     /// As [`E2eError`]; the payload must then not be used.
@@ -164,17 +165,13 @@ impl Receiver {
         payload: &Payload,
     ) -> Result<u8, E2eError> {
         let counter = verify(config.data_id, payload)?;
-        let reference = if self.timed_out(config, now) {
-            None
-        } else {
-            self.last_counter
-        };
-        self.last_counter = Some(counter);
-        let lost = match reference {
-            None => 0,
+        let lost = match self.last_counter.replace(counter) {
             Some(last) if last == counter => return Err(E2eError::Repeated),
             // Both are below 15: 15 + counter − last − 1 is 0 … 28.
-            Some(last) => (COUNTER_MODULO + counter - last - 1) % COUNTER_MODULO,
+            Some(last) if !self.timed_out(config, now) => {
+                (COUNTER_MODULO + counter - last - 1) % COUNTER_MODULO
+            }
+            _ => 0,
         };
         if lost > config.max_lost {
             return Err(E2eError::WrongSequence { lost });
@@ -284,9 +281,30 @@ mod tests {
         // One step back looks like 13 lost.
         assert_eq!(take(7, 600), Err(E2eError::WrongSequence { lost: 13 }));
         assert_eq!(take(8, 700), Ok(0));
-        // After silence even the same counter starts anew.
+        // After silence any counter starts anew, but the one before.
         assert_eq!(take(8, 1_200), Err(E2eError::Repeated));
-        assert_eq!(take(8, 1_201), Ok(0));
+        assert_eq!(take(8, 1_201), Err(E2eError::Repeated));
+        assert_eq!(take(3, 1_202), Ok(0));
+    }
+
+    #[test]
+    fn a_sender_that_repeats_one_frame_for_ever_is_accepted_once() {
+        let mut receiver = Receiver::default();
+        let frozen = frame(CONFIG.data_id, 7, [1, 2, 3, 4, 5, 6]);
+        for ms in (0..60_000).step_by(100) {
+            let expected = match ms {
+                0 => Ok(0),
+                _ => Err(E2eError::Repeated),
+            };
+            assert_eq!(
+                receiver.check(&CONFIG, at(ms), &frozen),
+                expected,
+                "{ms} ms"
+            );
+        }
+        assert!(receiver.timed_out(&CONFIG, at(60_000)));
+        let next = frame(CONFIG.data_id, 8, [1, 2, 3, 4, 5, 6]);
+        assert_eq!(receiver.check(&CONFIG, at(60_000), &next), Ok(0));
     }
 
     #[test]

@@ -251,6 +251,8 @@ pub struct Measurement {
     conversions: u32,
     invalid_conversions: u32,
     refused_steps: u32,
+    /// The newest conversion was refused for its rate of change.
+    rate_refused: bool,
     reading: CurrentReading,
     average: SlidingAverage,
     open_sensor: OpenSensor,
@@ -457,6 +459,7 @@ impl Measurement {
             conversions: 0,
             invalid_conversions: 0,
             refused_steps: 0,
+            rate_refused: false,
             reading: Converter::new().reading(&prepared.converter, now),
             average: SlidingAverage::new(),
             open_sensor: OpenSensor::new(),
@@ -659,17 +662,19 @@ impl Measurement {
             self.soc.declare_loss(&self.prepared.soc, doubt);
         }
         let now = report.at.unwrap_or(self.now);
+        // No rest by a current that is doubted, nor against the other channel. (A calibration doubts none at rest.)
+        let rest_current = configuration.soc.rest_current;
+        let is_known = self.reading.validity.and(self.effects.current).is_valid()
+            && self
+                .meter_mean()
+                .is_none_or(|mean| mean.saturating_abs() <= rest_current);
         self.soc.update(
             &self.prepared.soc,
             &configuration.ocv,
             &SocInput {
                 now,
                 charge_total: report.charge_total,
-                current: self
-                    .reading
-                    .validity
-                    .is_valid()
-                    .then_some(self.reading.current),
+                current: is_known.then_some(self.reading.current),
                 cell_voltage: self.cell_voltage,
             },
         );
@@ -747,7 +752,6 @@ impl Measurement {
         let conditions = self.conditions(configuration).union(external);
         let changes = self.diagnosis.step(now, conditions);
         self.effects = self.diagnosis.effects();
-        self.refused_steps = self.converter.counters().steps_refused;
         Tick {
             hv_permit: self.key_outputs.hv_permit,
             changes,
@@ -934,6 +938,9 @@ impl Measurement {
         self.history = *history;
         self.reading = reading;
         self.conversions = self.conversions.wrapping_add(1);
+        // Kept with the reading: it stands for several ticks.
+        let refused = self.converter.counters().steps_refused;
+        self.rate_refused = core::mem::replace(&mut self.refused_steps, refused) != refused;
         if !reading.validity.is_valid() {
             self.invalid_conversions = self.invalid_conversions.saturating_add(1);
         }
@@ -1102,9 +1109,8 @@ impl Measurement {
         let too_hot_or_cold = |temperature: Option<MilliCelsius>| {
             temperature.is_some_and(|temperature| !(lowest..=highest).contains(&temperature))
         };
-        let counters = self.converter.counters();
         let implausible = self.reading.validity.contains(Validity::IMPLAUSIBLE);
-        let by_rate = implausible && counters.steps_refused != self.refused_steps;
+        let by_rate = implausible && self.rate_refused;
         let has_no_relations = matches!(
             configuration.front_end,
             FrontEnd::ClosedLoop(sensor) if sensor.relations == SupplyRelations::default()
@@ -1161,7 +1167,7 @@ impl Measurement {
             (Code::ZeroDriftBeyondLimit, self.zero_beyond_limit),
             (
                 Code::SocUncertain,
-                self.soc_reading.uncertainty > SOC_UNCERTAINTY_LIMIT,
+                self.soc_reading.presented_uncertainty() > SOC_UNCERTAINTY_LIMIT,
             ),
             (Code::CellVoltageMissing, !self.vehicle.voltage_fresh),
             (Code::VehicleStateMissing, !self.vehicle.state_fresh),
@@ -1196,9 +1202,16 @@ impl Measurement {
         self.meter_causes.and(self.effects.charge)
     }
 
+    /// It follows the meter: what is missing there is missing here. Before the meter's first reading what was restored
+    /// stands.
     fn soc_validity(&self) -> Validity {
+        let of_meter = match self.meter.at {
+            Some(_) => self.meter_causes.without(Validity::CALIBRATING),
+            None => Validity::VALID,
+        };
         self.effects
             .soc
+            .and(of_meter)
             .and_if(!self.soc_reading.known, Validity::STALE)
     }
 
@@ -1277,7 +1290,7 @@ impl Measurement {
         can::StateOfCharge {
             state_of_charge: self.soc_reading.presented,
             validity: self.soc_validity(),
-            uncertainty: known.then_some(self.soc_reading.uncertainty),
+            uncertainty: known.then(|| self.soc_reading.presented_uncertainty()),
             remaining: known.then_some(self.soc_reading.remaining),
         }
     }
@@ -1426,7 +1439,7 @@ impl Measurement {
             (readings.channel_difference, readings.channel_bound) = (difference, bound);
         }
         readings.soc = self.soc_reading.presented;
-        readings.soc_uncertainty = self.soc_reading.uncertainty;
+        readings.soc_uncertainty = self.soc_reading.presented_uncertainty();
         readings.soc_validity = self.soc_validity();
         readings.remaining_charge = self.soc_reading.remaining;
         readings.soc_anchors = self.soc_reading.anchors;

@@ -227,9 +227,17 @@ impl CommandRule {
             true => Err(Exception::ServerDeviceBusy),
             false => Ok(()),
         };
+        // A restore would put another correction under what is being taken.
+        let settings_stay = || match readings.configuration_in_transfer {
+            true => Err(Exception::ServerDeviceBusy),
+            false => Ok(()),
+        };
         match self {
             Self::Always => Ok(()),
-            Self::Idle => When::Standstill.check(readings),
+            Self::Idle => {
+                When::Standstill.check(readings)?;
+                settings_stay()
+            }
             Self::IdleFlashFree => {
                 When::Standstill.check(readings)?;
                 flash_free()
@@ -237,7 +245,7 @@ impl CommandRule {
             Self::SupplySweep => {
                 quiet()?;
                 match readings.activity {
-                    Activity::None | Activity::SupplyCalibration => Ok(()),
+                    Activity::None | Activity::SupplyCalibration => settings_stay(),
                     Activity::ZeroDrift | Activity::KeyCalibration => {
                         Err(Exception::ServerDeviceBusy)
                     }
@@ -246,7 +254,7 @@ impl CommandRule {
             Self::SupplySweepBegun => {
                 quiet()?;
                 match readings.activity {
-                    Activity::SupplyCalibration => Ok(()),
+                    Activity::SupplyCalibration => settings_stay(),
                     Activity::None => Err(Exception::ServerDeviceFailure),
                     Activity::ZeroDrift | Activity::KeyCalibration => {
                         Err(Exception::ServerDeviceBusy)
@@ -991,6 +999,24 @@ mod tests {
         assert_eq!(board.write_one(ADDRESS + 2, 4), Err(2));
         assert_eq!(board.store.active().rtu.address, 3);
         assert_eq!(board.read(3, ADDRESS, 1), Ok([3].to_vec()));
+        // Nor is anything taken of a sensor whose correction a restore is about to replace.
+        for order in [0x5A01, 0x5A02, 0x5A03, 0x5A04] {
+            assert_eq!(
+                board.write_one(COMMAND_ADDRESS, order),
+                Err(6),
+                "{order:#x}"
+            );
+        }
+        board.readings.activity = Activity::SupplyCalibration;
+        for order in [0x5A03, 0x5A04, 0x5A05] {
+            assert_eq!(
+                board.write_one(COMMAND_ADDRESS, order),
+                Err(6),
+                "{order:#x}"
+            );
+        }
+        board.readings.high_voltage_on = true;
+        assert_eq!(board.write_one(COMMAND_ADDRESS, 0x5A01), Err(4));
         // An order that the flash has no part in.
         assert!(board.write_one(COMMAND_ADDRESS, 0x5A06).is_ok());
     }

@@ -23,7 +23,7 @@
 //! there before).
 //!
 //! **On the bus.** The estimate moves at once, the presented value follows it by at most
-//! [`SocConfig::presented_slew_ppm_per_s`]. Only the very first anchor is presented at once: until then the state of
+//! [`SocConfig::presented_slew_ppm_per_s`]; what is between them is added to the half-width that goes out. Only the very first anchor is presented at once: until then the state of
 //! charge is marked as not known.
 
 use serde::{Deserialize, Serialize};
@@ -283,6 +283,16 @@ pub struct SocReading {
     pub counter_jumps: u32,
 }
 
+impl SocReading {
+    /// Half-width of [`SocReading::presented`]: while it follows the estimate its distance counts too.
+    #[must_use]
+    pub fn presented_uncertainty(&self) -> Ppm {
+        let distance = self.presented.get().abs_diff(self.estimate.get());
+        let half_width = self.uncertainty.get().saturating_add_unsigned(distance);
+        Ppm(half_width.min(Ppm::ONE.get()))
+    }
+}
+
 /// What an update did beyond integrating.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -410,6 +420,9 @@ impl Soc {
         ] {
             charge.0 = mul_div(charge.get(), new.capacity, old.capacity);
         }
+        self.anchored_at = self
+            .anchored_at
+            .map(|after| mul_div(after, new.capacity, old.capacity));
     }
 
     /// Integrates up to `input.now`, and once a second looks after uncertainty and rest.
@@ -1377,6 +1390,14 @@ mod tests {
         assert!((after.presented.get() - before.presented.get()).abs() <= 1);
         assert!((after.uncertainty.get() - before.uncertainty.get()).abs() <= 1);
         assert_eq!(after.remaining.get(), before.remaining.get() / 5 * 4);
+        // Of the same share, the uncertainty has not doubled: no second anchor within this rest.
+        bench.coefficients = SocCoefficients::new(&SocConfig {
+            capacity_mah: 1_000_000,
+            ..config()
+        });
+        bench.soc.change_capacity(&aged, &bench.coefficients);
+        bench.rest(600);
+        assert_eq!(bench.reading().anchors, before.anchors);
     }
 
     #[test]

@@ -1116,6 +1116,118 @@ fn a_mean_that_moves_by_other_factors_makes_no_converter_stuck() {
     assert!(bench.has(Code::ConverterStuck));
 }
 
+/// After an anchor the presented value is still far from the estimate: what is sent with it covers the estimate's interval.
+#[test]
+fn what_is_presented_is_within_its_uncertainty_of_the_estimate() {
+    let mut bench = Bench::new(Configuration::default());
+    bench
+        .measurement
+        .set_state_of_charge(Ppm(500_000), Ppm(400_000));
+    let capacity = bench.configuration.soc.capacity_mah;
+    let share = |charge: Nanocoulombs| charge.get() as f64 / (f64::from(capacity) * 3.6e9) * 1e6;
+    let mut farthest = 0.0_f64;
+    for _ in 0..2_500 {
+        bench.measurement.on_battery_voltage(
+            &BatteryVoltage {
+                cell: Some(Microvolts::from_millivolts(4_000)),
+                pack: None,
+                cell_temperature: None,
+            },
+            Instant::from_ticks(bench.now),
+        );
+        bench.run_ms(1_000);
+        let sent = bench.measurement.state_of_charge();
+        let kept = bench.measurement.retained(0).soc;
+        let distance = (share(kept.remaining) - f64::from(sent.state_of_charge.get())).abs();
+        farthest = farthest.max(distance);
+        let half_width = f64::from(sent.uncertainty.unwrap().get());
+        assert!(
+            half_width + 3.0 >= distance + share(kept.uncertainty),
+            "{half_width} ppm at {distance} ppm"
+        );
+        let readings = bench.readings();
+        assert_eq!(Some(readings.soc_uncertainty), sent.uncertainty);
+    }
+    assert!(farthest > 100_000.0, "{farthest}");
+}
+
+/// One refused step: a rate, not a converter that is stuck, for as long as its reading is the newest.
+#[test]
+fn a_refused_step_is_not_called_stuck() {
+    let mut bench = Bench::new(with_front_end(FrontEnd::Hah1bv(Hah1bv::default())));
+    bench.run_ms(1_500);
+    assert!(bench.measurement.current().validity.is_valid());
+    // 400 A within one conversion.
+    bench.code += 2_622;
+    let mut named = false;
+    for _ in 0..50 {
+        bench.run_ms(10);
+        named |= bench.has(Code::RateImplausible);
+        assert!(!bench.has(Code::ConverterStuck), "{} us", bench.now);
+    }
+    assert!(named);
+    // Two conversions, and the 100 ms that the row keeps it.
+    assert!(bench.measurement.current().validity.is_valid());
+}
+
+/// The current is known to be wrong, or the meter sees one: no rest, whatever the converter reads.
+#[test]
+fn no_anchor_while_the_current_is_known_to_be_wrong() {
+    for (amps, anchors) in [(0, 1), (20, 0)] {
+        let mut bench = Bench::new(Configuration::default());
+        bench
+            .measurement
+            .set_state_of_charge(Ppm(500_000), Ppm(150_000));
+        bench.report.mean_current = Microamps::from_amps(amps);
+        for _ in 0..2_000 {
+            bench.measurement.on_battery_voltage(
+                &BatteryVoltage {
+                    cell: Some(Microvolts::from_millivolts(4_000)),
+                    pack: None,
+                    cell_temperature: None,
+                },
+                Instant::from_ticks(bench.now),
+            );
+            // The meter counts on, the converter stands at 0 A: its last bit moves.
+            bench.code ^= 1;
+            let counted = Nanocoulombs::from_coulombs(i64::from(amps));
+            bench.report.charge_total = bench.report.charge_total.saturating_add(counted);
+            bench.run_ms(1_000);
+        }
+        assert_eq!(bench.readings().soc_anchors, anchors, "{amps} A");
+    }
+}
+
+/// What the charge is doubted for by the meter's owner, the state of charge that follows it is as well.
+#[test]
+fn a_stale_meter_makes_the_state_of_charge_stale() {
+    let mut bench = Bench::new(Configuration::default());
+    bench
+        .measurement
+        .set_state_of_charge(Ppm(500_000), Ppm(20_000));
+    let validity = |bench: &Bench| bench.measurement.state_of_charge().validity;
+    // Not before the meter was read: what was restored stands.
+    let report = MeterReport {
+        at: None,
+        ..bench.report
+    };
+    let causes = Validity::STALE.and(Validity::CALIBRATING);
+    bench
+        .measurement
+        .on_meter(&bench.configuration, &report, causes);
+    assert!(validity(&bench).is_valid());
+    bench.run_ms(1_000);
+    assert!(validity(&bench).is_valid());
+    for cause in [Validity::STALE, Validity::CHIP_FAULT] {
+        bench
+            .measurement
+            .on_meter(&bench.configuration, &bench.report, cause);
+        assert_eq!(validity(&bench), cause);
+    }
+    bench.run_ms(20);
+    assert!(validity(&bench).is_valid());
+}
+
 /// With the small sensor open the large one is right at any current: no contradiction to the flag.
 #[test]
 fn the_large_sensor_in_the_small_ones_place_is_no_implausible_flag() {

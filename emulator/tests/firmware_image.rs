@@ -209,6 +209,45 @@ fn key_factors_that_a_client_sets_are_used() {
     assert!((back_a - before_a).abs() < 0.05, "{before_a} {back_a}");
 }
 
+/// Over a loss of power those that were saved: not what the charge's record had before the save, nor what came after it.
+#[test]
+fn key_factors_that_were_saved_are_in_force_after_a_loss_of_power() {
+    const FACTOR_K: u16 = 0x0420;
+    let firmware = firmware();
+    let parked = Row::at_rest(0.0).with_key(Key::Off);
+    let scenario = Scenario::steady(parked, Contactors::Permitted);
+    let mut rig = Rig::new(&firmware, Setup::nominal(scenario)).unwrap();
+    rig.run_s(1.5).unwrap();
+    assert_eq!(set(&mut rig, FACTOR_K, &words_of(1_020_000_000)), Ok(()));
+    assert_eq!(set(&mut rig, 0x0000, &[0x5A07]), Ok(()));
+    rig.run_s(0.5).unwrap();
+    for _ in 0..2 {
+        rig.power_cycle();
+        rig.view = Default::default();
+        rig.run_s(1.0).unwrap();
+        assert_eq!(settings(&mut rig, FACTOR_K, 2), words_of(1_020_000_000));
+        // Not saved.
+        assert_eq!(set(&mut rig, FACTOR_K, &words_of(1_030_000_000)), Ok(()));
+        rig.run_s(0.5).unwrap();
+    }
+}
+
+/// Not at the factory's address either, which may be another one's on the line.
+#[test]
+fn nobody_is_answered_before_the_configuration_is_loaded() {
+    let firmware = firmware();
+    let mut rig = Rig::new(&firmware, driving(0.0)).unwrap();
+    rig.run_s(0.5).unwrap();
+    assert_eq!(set(&mut rig, 0x0900, &[7]), Ok(()));
+    let ask = |rig: &mut Rig<'_>, address: u8| rig.modbus(&[address, 4, 0, 0x28, 0, 4]);
+    assert!(rig.modbus(&[7, 6, 0, 0, 0x5A, 0x07]).is_ok());
+    rig.run_s(0.5).unwrap();
+    rig.power_cycle();
+    rig.run_for(Ticks::from_millis(5)).unwrap();
+    assert!(ask(&mut rig, 1).is_err());
+    assert!(ask(&mut rig, 7).is_ok());
+}
+
 /// 25 °C is too warm when the limit is 10 °C.
 #[test]
 fn temperature_limits_that_a_client_sets_are_used() {

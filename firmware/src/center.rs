@@ -89,6 +89,8 @@ pub struct Center {
     seconds: u32,
     shown: Option<Code>,
     meter_report_at: Option<Instant>,
+    /// Nothing was read of the meter for [`METER_STALE`].
+    meter_is_stale: bool,
     seen: Seen,
     last_codes: [u8; 8],
 }
@@ -136,6 +138,7 @@ impl Center {
             seconds: 0,
             shown: None,
             meter_report_at: None,
+            meter_is_stale: false,
             seen: Seen::default(),
             last_codes: [255; 8],
         }
@@ -256,6 +259,7 @@ impl Center {
     fn on_meter(&mut self, now: Instant, link: &MeterLink) {
         let report = &link.report;
         let stale = report.at.is_none_or(|at| elapsed(at, now) > METER_STALE);
+        self.meter_is_stale = stale;
         let causes = Validity::VALID
             .and_if(link.in_self_test, Validity::CALIBRATING)
             .and_if(!link.health.counting, Validity::CHIP_FAULT)
@@ -279,7 +283,10 @@ impl Center {
         let bus = self.bus.counters();
         let rows = [
             // During the self-test the chip answers; it just counts nothing that anybody may use.
-            (Code::MeterNoAnswer, !health.counting && !link.in_self_test),
+            (
+                Code::MeterNoAnswer,
+                (!health.counting || self.meter_is_stale) && !link.in_self_test,
+            ),
             (Code::MeterDeadBus, health.dead_bus),
             (Code::MeterChecksum, seen.checksum_bad),
             (Code::MeterReset, grown(&mut seen.resets, health.resets)),

@@ -55,7 +55,7 @@ mod app {
         meter::{MeterChannel, MeterReport},
         modbus::{Command, CommandState, Event, Readings},
         modbus_rtu::Server,
-        retained::{RetainSlots, RetainedState, SavePolicy, SavePolicyConfig, Slot},
+        retained::{RetainSlots, RetainedState, SavePolicy, Slot},
         storm::StormConfig,
         units::{Duration, Instant, Nanocoulombs, elapsed},
     };
@@ -227,9 +227,8 @@ mod app {
             storage: Storage::new(board.flash_spi),
             previous,
         };
-        // The queues are empty: both take one.
+        // The queue is empty: it takes one.
         let _ = storage::spawn();
-        let _ = rs485::spawn();
         retain::note_stage(Stage::Running);
         (shared, local)
     }
@@ -259,9 +258,7 @@ mod app {
         let mut noted = 0;
         let mut all = false;
         let start = time::now();
-        for task in [Task::Storage, Task::Rs485] {
-            check_in.enable(task, start);
-        }
+        check_in.enable(Task::Storage, start);
         let mut looked = time::micros();
         loop {
             // Every interrupt ends the sleep, a thousand of them a second; who is late is late by more than this.
@@ -638,6 +635,8 @@ mod app {
         let Some(mut wake) = RS485_WAKE.try_take_reader() else {
             return;
         };
+        // Nobody waits any more for an answer to what came before the start.
+        while cx.local.characters_out.dequeue().is_some() {}
         let mut server = Server::new(time::now());
         let mut last_command = 0;
         let mut errors = 0;
@@ -868,7 +867,7 @@ mod app {
             }
             *administration.store.active()
         });
-        let start = retained_state(cx.local.previous, &state, &configuration.save_policy);
+        let start = retained_state(cx.local.previous, &state, &configuration);
         // The next start must not find nothing, nor what is older than this one's.
         let mut first_save = !start.is_in_flash;
         let charge = start.state.map(|state| state.charge_total);
@@ -911,6 +910,8 @@ mod app {
         let _ = meter_owner::spawn(charge, now);
         let _ = conversion::spawn();
         let _ = tick::spawn();
+        // Not before its address and what it would change are loaded.
+        let _ = rs485::spawn();
 
         let mut policy = SavePolicy::new(now, charge.unwrap_or(Nanocoulombs::ZERO));
         let mut since_log_ms = 0;
@@ -979,12 +980,13 @@ mod app {
         is_refused: bool,
     }
 
-    /// The slots' state, else the one of the flash, which `policy` wrote.
+    /// The slots' state, else the one of the flash, which the policy of `configuration` wrote.
     fn retained_state(
         previous: &Previous,
         stored: &Stored<RetainedState>,
-        policy: &SavePolicyConfig,
+        configuration: &Configuration,
     ) -> Start {
+        let policy = &configuration.save_policy;
         let mut start = Start {
             state: None,
             slots: RetainSlots::empty(),
@@ -1002,7 +1004,11 @@ mod app {
                 start.loss = identity::loss_over_reset(previous, policy);
             }
             (Err(_), Stored::Value(state) | Stored::Older(state)) => {
-                start.state = Some(*state);
+                start.state = Some(RetainedState {
+                    // It may be older than the last "save": what was saved is in force.
+                    key_factors: configuration.key_factors,
+                    ..*state
+                });
                 start.loss = identity::loss_over_power_off(policy);
                 if matches!(stored, Stored::Older(_)) {
                     // A save interval more.

@@ -41,7 +41,9 @@ impl Character {
     /// The byte, what was wrong with it and when it ended.
     pub fn unpack(self) -> (u8, LineErrors, Instant) {
         let now = time::now();
-        let age = time::micros().wrapping_sub(self.at);
+        // Of the same moment: with a second look at the counter a preemption between them would make it older.
+        let [a, b, c, d, ..] = now.as_ticks().to_le_bytes();
+        let age = u32::from_le_bytes([a, b, c, d]).wrapping_sub(self.at);
         let at = now
             .checked_sub_duration(Duration::from_ticks(u64::from(age)))
             .unwrap_or(now);

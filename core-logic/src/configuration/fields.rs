@@ -406,7 +406,7 @@ fields! {
     0x050E I32 1 Standstill (FULL_SCALE.0, FULL_SCALE.1) "switching current" "µA" "at which the comparators switch" [at meter.switching_current];
     0x0510 I32 1 Standstill (0, 100_000_000) "switching tolerance" "µA" "of the switching current" [at meter.switching_tolerance];
     0x0512 U32 1 Standstill (0, 10_000_000) "meter: slew limit" "A/s" "fastest change of the current that estimates allow for" [at meter.slew_limit_amps_per_second];
-    0x0514 U32 1 Standstill (0, 1_000_000) "meter: short interval" "µs" "intervals with chatter up to this wait for the next reading" [at meter.short_interval_us];
+    0x0514 U32 1 Standstill (0, 80_000) "meter: short interval" "µs" "intervals with chatter up to this wait for the next reading, which the meter is not stale by: 100 ms" [at meter.short_interval_us];
     0x0516 U32 1 Standstill (0, 10_000) "meter: front-end delay" "µs" "of the filter before V1" [at meter.front_end_delay_us];
     0x0518 U32 1 Always (20, 60_000) "meter: mean window" "ms" "of the mean current" [at meter.mean_window_ms];
     0x051A I32 1 Always (0, 1_000_000) "meter: bridge gain" "ppm" "by which the current that bridges a gap may be off" [at meter.bridge_gain];

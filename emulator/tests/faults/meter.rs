@@ -57,6 +57,26 @@ fn fault_f01_flipped_bits_cost_no_charge_and_are_counted() {
     assert!(error_c.abs() <= quantum_c(Range::Small), "{error_c}");
 }
 
+/// A chip of which every read fails its checksum is set up for all that it knows: it cannot be read all the same.
+#[test]
+fn fault_f01_a_meter_that_cannot_be_read_is_told() {
+    let mut rig = steady(50.0);
+    assert!(!rig.view.active_diagnoses().contains(&"MeterNoAnswer"));
+    strike(&mut rig, "F1:1,2s");
+    // Stale after 100 ms, the diagnosis's 40 ms, and the frame.
+    let told_s = until_diagnosis(&mut rig, "MeterNoAnswer", 0.3);
+    rig.run_s(0.2).unwrap();
+    println!(
+        "F1: MeterNoAnswer {:.0} ms after every bit flips",
+        told_s * 1e3
+    );
+    assert!(rig.view.charge_c().valid().is_none());
+    assert!(rig.view.soc_pct().valid().is_none());
+    rig.run_s(2.5).unwrap();
+    assert!(!rig.view.active_diagnoses().contains(&"MeterNoAnswer"));
+    assert!(rig.view.charge_c().valid().is_some());
+}
+
 #[test]
 fn fault_f02_compensating_flips_are_rejected_or_taken_back() {
     let mut rig = pulse(50.0, 3.0);
