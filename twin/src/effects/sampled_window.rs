@@ -121,6 +121,9 @@ impl Effect for SampledWindow {
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (period, duty, phase) = (values[0], values[1], values[2]);
+        if period <= 0.0 {
+            return;
+        }
         let drive = scene.drive;
         let held = scene.held();
         let input = &scene.signal[..];
