@@ -615,6 +615,36 @@ mod tests {
     }
 
     #[test]
+    fn a_pack_is_its_cells_with_the_same_values() {
+        for effect in LIBRARY {
+            let id = effect.card().id;
+            let values = match id {
+                "charge-transfer" => vec![4.0],
+                "polarisation" => [0.003, 5.0, 0.002, 20.0, 0.004, 60.0].to_vec(),
+                "diffusion" => vec![0.01, 50.0, 0.5],
+                "ocv-hysteresis" => vec![0.02, 300.0],
+                "resistance-temperature" => vec![2500.0],
+                "resistance-soc" => vec![2.0, 0.9],
+                "cell-self-heating" => vec![20.0, 30.0],
+                "entropic" => vec![4e-4],
+                _ => continue,
+            };
+            let values = values[..effect.card().parameters.len()].to_vec();
+            let has_cell_temperature = id != "cell-self-heating";
+            let [cell, pack] = [1.0, 96.0].map(|cells| {
+                let problem = problem(View::Voltage, battery(cells), has_cell_temperature);
+                let plain = said(&problem, &[]);
+                let with = said(&problem, &[(effect, values.clone())]);
+                (plain, with)
+            });
+            assert!(cell.0 != cell.1, "{id} did nothing");
+            for (cell, pack) in cell.1.iter().zip(&pack.1) {
+                assert!((96.0 * cell - pack).abs() < 1e-9, "{id}: {cell}, {pack}");
+            }
+        }
+    }
+
+    #[test]
     fn what_it_looks_like_exists() {
         for effect in LIBRARY {
             for other in effect.card().looks_like {

@@ -46,10 +46,8 @@ pub struct Scale {
     pub operation_s: f64,
     /// Capacity of the battery in Ah, 0 without one.
     pub capacity_ah: f64,
-    /// Ohmic resistance by design in Ω.
+    /// Ohmic resistance of one cell by design in Ω.
     pub resistance_ohm: f64,
-    /// Cells in series, 0 without a battery.
-    pub cells: f64,
     /// Averaging window by design in s.
     pub window_s: f64,
     /// The converter's step by design.
@@ -102,7 +100,7 @@ pub struct Battery<'a> {
     pub arrhenius_k: Option<f64>,
     /// Factor on every resistance.
     pub factor: Series,
-    /// Voltage added to open circuit and ohmic drop, in V.
+    /// Voltage of one cell added to its open circuit and ohmic drop, in V.
     pub added_v: Series,
 }
 
@@ -794,13 +792,14 @@ impl<'a> Battery<'a> {
     /// The voltage from everything, in place of the current: open circuit, ohmic drop and what was added.
     pub fn voltage(&self, signal: &mut [f64]) {
         let ohms = self.base.resistance_ohm * self.resistance;
+        let cells = self.base.cells;
         for (((value, open_v), factor), added_v) in signal
             .iter_mut()
             .zip(&self.open_circuit_v)
             .zip(&self.factor)
             .zip(&self.added_v)
         {
-            *value = open_v - ohms * factor * *value + added_v;
+            *value = open_v - ohms * factor * *value + cells * added_v;
         }
     }
 }

@@ -610,8 +610,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         }
         Base::Battery(base) => {
             scale.capacity_ah = base.capacity_ah;
-            scale.resistance_ohm = base.resistance_ohm;
-            scale.cells = base.cells;
+            scale.resistance_ohm = base.resistance_ohm / base.cells;
         }
     }
     scale
