@@ -19,7 +19,7 @@ pub struct ChargeTransfer;
 static CARD: Card = Card {
     id: "charge-transfer",
     statement: "The overvoltage of the electrode reactions grows with the logarithm of a large current, not in proportion to it (Butler–Volmer).",
-    equation: "v = −(2RT/F)·(asinh x − x), x = i/(2·i0·k); k: R25/R(T) of resistance-temperature, 1 without it (Newman & Thomas-Alyea 2004)",
+    equation: "v = −(2RT/F)·(asinh x − x), x = i/(2·i0·k); k: R25/R as of temperature and state of charge (resistance-temperature, cell-self-heating, resistance-soc), 1 without them (Newman & Thomas-Alyea 2004)",
     parameters: &[Parameter::new(
         "i0_a",
         "A",

@@ -38,7 +38,7 @@ const fn card(parameters: &'static [Parameter]) -> Card {
     Card {
         id: "diffusion",
         statement: "Diffusion in the electrodes relaxes the voltage slowly, with the square root of time.",
-        equation: "v = −(1 − w)·i∗z − w·(OCV(SoC) − OCV(SoC − i∗z/m)), Z(s) = R·tanh(√(sτ))/√(sτ); w: ocv_share, 0 without it; m: mean slope of OCV from 20 to 80 %",
+        equation: "v = −(1 − w)·(k·i)∗z − w·(OCV(SoC) − OCV(SoC − (k·i)∗z/m)), Z(s) = R·tanh(√(sτ))/√(sτ); w: ocv_share, 0 without it; m: mean slope of OCV from 20 to 80 %; k: R/R25 as of temperature and state of charge (resistance-temperature, cell-self-heating, resistance-soc), 1 without them",
         parameters,
         shows: "very slow relaxation",
         looks_like: &["polarisation"],
