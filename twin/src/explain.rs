@@ -315,7 +315,7 @@ fn tell(
         .remarks
         .extend(times_found(&read, &selection.fit, between));
     if verdict != Verdict::Unknown {
-        report.remarks.extend(slips(&read, shown));
+        report.remarks.extend(slips(&read, shown, verdict));
     }
     report.plots.push(plots(&read, shown, &held.read));
     let mut sentence = sentence(
