@@ -308,9 +308,11 @@ fn tell(
         });
     }
     report.models.push(fitted(problem, &selection.fit));
-    report
-        .remarks
-        .extend(base_found(&problem.name, selection.fit.model.nuisance));
+    report.remarks.extend(base_found(
+        &problem.name,
+        selection.fit.model.nuisance,
+        &problem.base,
+    ));
     report
         .remarks
         .extend(times_found(&read, &selection.fit, between));
