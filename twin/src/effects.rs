@@ -450,6 +450,9 @@ fn spaced(from: f64, to: f64, count: usize) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::problem::{
+        Accuracy, Base, BatteryBase, Coloured, Drive, Observed, SensorBase, Series,
+    };
 
     #[test]
     fn ids_and_parameter_names_are_the_contract() {
@@ -507,6 +510,135 @@ mod tests {
         assert_eq!(table.len(), expected.len());
         for ((id, names), (expected_id, expected_names)) in table.iter().zip(expected) {
             assert_eq!((*id, names.as_slice()), (expected_id, expected_names));
+        }
+    }
+
+    /// 300 rows of a drive with everything that an effect asks for; the battery's surroundings at 0 °C.
+    fn problem(view: View, base: Base, has_cell_temperature: bool) -> Problem {
+        let series =
+            |of: &dyn Fn(f64) -> f64| -> Series { (0..300).map(|k| of(f64::from(k))).collect() };
+        let t_s = series(&|k| 0.5 * k);
+        let drive = Drive {
+            t_s: t_s.clone(),
+            reference: series(&|k| {
+                30.0 * (0.05 * k).sin() + if k % 70.0 < 30.0 { 20.0 } else { 0.0 }
+            }),
+            sensor_temperature_c: Some(series(&|k| 20.0 + 0.05 * k)),
+            supply_v: Some(series(&|k| 5.0 + 0.1 * (0.02 * k).sin())),
+            aux_a: Some(series(&|k| 10.0 * (0.09 * k).cos())),
+            range_high: Some(series(&|k| f64::from(k % 70.0 < 30.0))),
+            cell_temperature_c: has_cell_temperature.then(|| series(&|k| 5.0 + 0.01 * k)),
+            ambient_c: Some(series(&|_| 0.0)),
+            segments: std::iter::once(0..300).collect(),
+            continues: vec![false],
+            parts: 0,
+        };
+        Problem {
+            view,
+            name: "x".into(),
+            unit: "1".into(),
+            drive,
+            observed: Observed::with_drive(t_s, vec![0.0; 300]),
+            base,
+            modelled: Vec::new(),
+            noise: 0.0,
+            coloured: Coloured::default(),
+            accuracy: Accuracy::default(),
+        }
+    }
+
+    /// Of so many cells in series, as [`crate::prepare`] makes it.
+    fn battery(cells: f64) -> Base {
+        let cell = [(0.0, 3.0), (0.3, 3.5), (1.0, 4.1)];
+        Base::Battery(BatteryBase {
+            capacity_ah: 2.0,
+            efficiency: 1.0,
+            initial_soc: vec![0.5],
+            ocv: cell.map(|(soc, v)| (soc, cells * v)).to_vec(),
+            cells,
+            resistance_ohm: cells * 0.002,
+            ..BatteryBase::default()
+        })
+    }
+
+    fn said(problem: &Problem, effects: &[(&'static dyn Effect, Vec<f64>)]) -> Vec<f64> {
+        let members: Vec<(&'static dyn Effect, &[f64])> = effects
+            .iter()
+            .map(|(effect, values)| (*effect, values.as_slice()))
+            .collect();
+        chain::Chain::new(problem).run(&members, chain::Nuisance::default())
+    }
+
+    #[test]
+    fn an_effect_that_is_off_changes_nothing() {
+        let sensor = || {
+            Base::Sensor(SensorBase {
+                full_scale: Some(60.0),
+                range_ratio: 10.0,
+                range_limit: Some(15.0),
+                ..SensorBase::default()
+            })
+        };
+        let problems = [
+            problem(View::Sensor, sensor(), false),
+            problem(View::StateOfCharge, battery(1.0), false),
+            problem(View::Voltage, battery(1.0), false),
+            problem(View::Voltage, battery(96.0), true),
+        ];
+        let mut not_off = Vec::new();
+        for effect in LIBRARY {
+            let card = effect.card();
+            // Without a value of its own it is off at the design's.
+            let off = card.parameters.iter().map(|parameter| {
+                if parameter.off.is_nan() {
+                    2.0
+                } else {
+                    parameter.off
+                }
+            });
+            let off: Vec<f64> = off.collect();
+            let mut asked = 0;
+            for problem in problems.iter().filter(|problem| effect.applies(problem)) {
+                asked += 1;
+                let plain = said(problem, &[]);
+                let with = said(problem, &[(effect, off.clone())]);
+                let same = |(plain, with): (&f64, f64)| (plain - with).abs() < 1e-9;
+                if !plain.iter().zip(with).all(same) {
+                    not_off.push((card.id, problem.view));
+                }
+            }
+            assert!(asked > 0, "{}", card.id);
+        }
+        assert!(not_off.is_empty(), "{not_off:?}");
+    }
+
+    #[test]
+    fn a_pack_is_its_cells_with_the_same_values() {
+        for effect in LIBRARY {
+            let id = effect.card().id;
+            let values = match id {
+                "charge-transfer" => vec![4.0],
+                "polarisation" => [0.003, 5.0, 0.002, 20.0, 0.004, 60.0].to_vec(),
+                "diffusion" => vec![0.01, 50.0, 0.5],
+                "ocv-hysteresis" => vec![0.02, 300.0],
+                "resistance-temperature" => vec![2500.0],
+                "resistance-soc" => vec![2.0, 0.9],
+                "cell-self-heating" => vec![20.0, 30.0],
+                "entropic" => vec![4e-4],
+                _ => continue,
+            };
+            let values = values[..effect.card().parameters.len()].to_vec();
+            let has_cell_temperature = id != "cell-self-heating";
+            let [cell, pack] = [1.0, 96.0].map(|cells| {
+                let problem = problem(View::Voltage, battery(cells), has_cell_temperature);
+                let plain = said(&problem, &[]);
+                let with = said(&problem, &[(effect, values.clone())]);
+                (plain, with)
+            });
+            assert!(cell.0 != cell.1, "{id} did nothing");
+            for (cell, pack) in cell.1.iter().zip(&pack.1) {
+                assert!((96.0 * cell - pack).abs() < 1e-9, "{id}: {cell}, {pack}");
+            }
         }
     }
 

@@ -308,14 +308,16 @@ fn tell(
         });
     }
     report.models.push(fitted(problem, &selection.fit));
-    report
-        .remarks
-        .extend(base_found(&problem.name, selection.fit.model.nuisance));
+    report.remarks.extend(base_found(
+        &problem.name,
+        selection.fit.model.nuisance,
+        &problem.base,
+    ));
     report
         .remarks
         .extend(times_found(&read, &selection.fit, between));
     if verdict != Verdict::Unknown {
-        report.remarks.extend(slips(&read, shown));
+        report.remarks.extend(slips(&read, shown, verdict));
     }
     report.plots.push(plots(&read, shown, &held.read));
     let mut sentence = sentence(

@@ -175,6 +175,9 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
             checks::enough(&item.problem, frame.source())?;
         }
     }
+    if let Some(remark) = supply_without_range(&items) {
+        work.remark(remark);
+    }
     Ok(Prepared {
         items,
         remarks: work.remarks,
@@ -634,6 +637,26 @@ impl<'a> Work<'a> {
             }
         }
     }
+}
+
+/// What the supply moves is the zero, by the full scale: where that is not stated, a remark.
+fn supply_without_range(items: &[Item]) -> Option<String> {
+    const ID: &str = "supply-ratiometric";
+    let lacks = |item: &&Item| {
+        item.problem.drive.supply_v.is_some()
+            && matches!(&item.problem.base, Base::Sensor(sensor) if sensor.full_scale.is_none())
+    };
+    let problem = &items.iter().find(lacks)?.problem;
+    let is_stated = problem.modelled.iter().any(|(id, _)| *id == ID);
+    Some(format!(
+        "{}: the supply is recorded, but [sensor] states no full_scale, by which the zero moves with it: {}",
+        problem.name,
+        if is_stated {
+            format!("[effects.{ID}] moves the sensitivity only")
+        } else {
+            format!("{ID} is not looked for")
+        }
+    ))
 }
 
 /// Puts the effects of the model file into a problem, those that act in its view.

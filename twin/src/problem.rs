@@ -328,6 +328,16 @@ impl Drive {
         operations
     }
 
+    /// Of each segment, the operation that it is a part of.
+    pub fn operation_of_each(&self) -> Vec<Range<usize>> {
+        let operations = self.operations();
+        let of_segment = |rows: &Range<usize>| {
+            let at = operations.partition_point(|operation| operation.end <= rows.start);
+            operations.get(at).cloned().unwrap_or_else(|| rows.clone())
+        };
+        self.segments.iter().map(of_segment).collect()
+    }
+
     /// Whether a segment continues the one before.
     pub fn is_continued(&self, segment: usize) -> bool {
         segment > 0 && self.continues.get(segment).copied().unwrap_or_default()

@@ -149,6 +149,43 @@ fn a_core_and_its_heat_go_on_over_a_gap() {
     }
 }
 
+#[test]
+fn clocks_go_on_over_a_gap() {
+    for held_reference in [false, true] {
+        let sensor = Base::Sensor(SensorBase {
+            held_reference,
+            ..SensorBase::default()
+        });
+        for (id, values) in [
+            ("clock-skew", vec![2000.0]),
+            ("clock-skew", vec![-2000.0]),
+            ("delay", vec![0.8]),
+            ("sampled-window", vec![3.7, 0.4, 1.1]),
+            ("sampled-window", vec![0.3, 0.5, 0.0]),
+        ] {
+            assert_goes_on(View::Sensor, &sensor, id, &values);
+        }
+    }
+}
+
+/// The time that a clock lost before a gap is not lost anew; with another operation it starts from nothing.
+#[test]
+fn a_clock_starts_anew_with_another_operation() {
+    let sensor = Base::Sensor(SensorBase::default());
+    let (mut problem, rows) = problem(View::Sensor, sensor, true);
+    problem.drive.continues.fill(false);
+    let said = predict(&problem, &[("clock-skew".into(), vec![2000.0])]);
+    let begins = GAPS[0].end;
+    for (row, said) in rows.into_iter().zip(said) {
+        if (begins..GAPS[1].start).contains(&row) {
+            let at = begins as f64 + (row - begins) as f64 / 1.002;
+            let (before, share) = (at.floor() as usize, at.fract());
+            let expected = current_a(before) + share * (current_a(before + 1) - current_a(before));
+            assert!((said - expected).abs() < 1e-9, "row {row}");
+        }
+    }
+}
+
 /// A cell's heat acts through its resistance's law, wherever in the model file that stands.
 #[test]
 fn the_order_of_a_model_file_is_no_physics() {

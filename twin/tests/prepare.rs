@@ -393,6 +393,29 @@ fn the_state_of_charge_goes_on_over_a_gap() {
 }
 
 #[test]
+fn a_zero_that_follows_the_supply_needs_the_full_scale() {
+    let rows = (0..200).map(|k| {
+        let t = f64::from(k);
+        let v = 5.0 + 0.1 * (0.05 * t).sin();
+        vec![t, steps(t), steps(t) + 0.1 * (0.4 * t).sin(), v]
+    });
+    let recording = text("t_s,i_ref_a,i_meas_a,v_supply_v", rows);
+    let effect = twin::effects::find("supply-ratiometric").unwrap();
+    let says = |model: &str| {
+        let (problem, remarks) = one(&format!("schema = 1\n[sensor]\n{model}"), &recording);
+        let remark = remarks
+            .into_iter()
+            .find(|remark| remark.contains("no full_scale"));
+        (effect.applies(&problem), remark)
+    };
+    assert_eq!(says("full_scale = 100\n"), (true, None));
+    let (applies, remark) = says("");
+    assert!(!applies && remark.unwrap().contains("is not looked for"));
+    let (_, remark) = says("[effects.supply-ratiometric]\nratio = 0.5\n");
+    assert!(remark.unwrap().contains("sensitivity only"));
+}
+
+#[test]
 fn a_pack_is_its_cells_in_series() {
     let rows = (0..100).map(|k| {
         let i = current(f64::from(k));

@@ -14,7 +14,7 @@ pub struct CellSelfHeating;
 static CARD: Card = Card {
     id: "cell-self-heating",
     statement: "Losses warm the cell, which lowers its resistance.",
-    equation: "T = T₀ + ΔT, τ·dΔT/dt + ΔT = rth·R(T)·i²; R(T) with B of resistance-temperature, 2000 K without it",
+    equation: "T = T₀ + ΔT, τ·dΔT/dt + ΔT = rth·R(T)·i²; R(T) of resistance-temperature; without it the resistance by design is that at T₀, and B is 2000 K",
     parameters: &[
         Parameter::new("rth_k_per_w", "K/W", 0.0, Search::Smooth),
         Parameter::new("tau_s", "s", 300.0, Search::Logarithmic),
@@ -55,8 +55,20 @@ impl Effect for CellSelfHeating {
             return;
         };
         let (rth_k_per_w, tau_s) = (values[0], values[1]);
-        let ohms = battery.base.resistance_ohm;
-        let b_k = *battery.arrhenius_k.get_or_insert(USUAL_B_K);
+        let ohms = battery.base.resistance_ohm / battery.base.cells;
+        // Where the surroundings' temperature acts on nothing, only the cell's own heat does.
+        let (b_k, stated) = match battery.arrhenius_k {
+            Some(b_k) => (b_k, true),
+            None => (USUAL_B_K, false),
+        };
+        let factor_at = |around_c: f64, warmer_k: f64| {
+            let from_25 = arrhenius(b_k, around_c + warmer_k);
+            if stated {
+                from_25
+            } else {
+                from_25 / arrhenius(b_k, around_c)
+            }
+        };
         for rows in drive
             .operations()
             .into_iter()
@@ -68,16 +80,22 @@ impl Effect for CellSelfHeating {
             let currents = scene.signal[rows.clone()].windows(2);
             let around = &mut battery.temperature_c[rows.start..rows.end];
             let mut before_c = around[0];
-            for ((times, pair), t) in times.zip(currents).zip(&mut around[1..]) {
+            let factors = &mut battery.factor[rows.start + 1..rows.end];
+            for (((times, pair), t), factor) in
+                times.zip(currents).zip(&mut around[1..]).zip(factors)
+            {
                 let step = times[1] - times[0];
                 if step != step_s {
                     (step_s, kept) = (step, (-step / tau_s).exp());
                 }
                 // The mean square of a current that goes in a straight line, at the temperature where the step begins.
                 let square = (pair[0] * pair[0] + pair[0] * pair[1] + pair[1] * pair[1]) / 3.0;
-                let loss_w = ohms * arrhenius(b_k, before_c + warmer_k) * square;
+                let loss_w = ohms * factor_at(before_c, warmer_k) * square;
                 warmer_k = kept * warmer_k + (1.0 - kept) * rth_k_per_w * loss_w;
                 before_c = *t;
+                if !stated {
+                    *factor *= factor_at(before_c, warmer_k);
+                }
                 *t += warmer_k;
             }
         }

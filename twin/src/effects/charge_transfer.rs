@@ -19,7 +19,7 @@ pub struct ChargeTransfer;
 static CARD: Card = Card {
     id: "charge-transfer",
     statement: "The overvoltage of the electrode reactions grows with the logarithm of a large current, not in proportion to it (Butler–Volmer).",
-    equation: "v = −(2RT/F)·(asinh x − x), x = i/(2·i0·k); k: R25/R(T) of resistance-temperature, 1 without it (Newman & Thomas-Alyea 2004)",
+    equation: "v = −(2RT/F)·(asinh x − x), x = i/(2·i0·k); k: R25/R as of temperature and state of charge (resistance-temperature, cell-self-heating, resistance-soc), 1 without them (Newman & Thomas-Alyea 2004)",
     parameters: &[Parameter::new(
         "i0_a",
         "A",
@@ -52,7 +52,7 @@ impl Effect for ChargeTransfer {
 
     fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
         let most = STRAIGHT * scale.largest;
-        let thermal_v = scale.cells * R_OVER_F * (REFERENCE_C + ZERO_CELSIUS_K);
+        let thermal_v = R_OVER_F * (REFERENCE_C + ZERO_CELSIUS_K);
         let least = thermal_v / (MOST * scale.resistance_ohm);
         (least.min(most), most)
     }
@@ -70,7 +70,6 @@ impl Effect for ChargeTransfer {
         let Some(battery) = &mut scene.battery else {
             return;
         };
-        let cells = battery.base.cells;
         for (((added, i), factor), t) in battery
             .added_v
             .iter_mut()
@@ -78,7 +77,7 @@ impl Effect for ChargeTransfer {
             .zip(&battery.factor)
             .zip(&battery.temperature_c)
         {
-            *added += cells * promised_v(*i, values[0] / factor, *t);
+            *added += promised_v(*i, values[0] / factor, *t);
         }
     }
 }

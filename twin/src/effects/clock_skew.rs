@@ -29,8 +29,10 @@ impl Effect for ClockSkew {
 
     fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
         // The last edge moved by a fraction of a step up to many.
-        let least = (0.3 * scale.step_s / scale.span_s * 1e6).max(1.0);
-        spaced(least, (300.0 * least).min(20_000.0).max(2.0 * least), 7)
+        let moving = |over_s: f64| (0.3 * scale.step_s / over_s * 1e6).max(1.0);
+        // A gap makes what is seen less, and what a clock has lost by then no less.
+        let (least, most) = (moving(scale.operation_s), 300.0 * moving(scale.span_s));
+        spaced(least, most.min(20_000.0).max(2.0 * least), 7)
             .into_iter()
             .flat_map(|skew| [vec![skew], vec![-skew]])
             .collect()

@@ -38,7 +38,7 @@ const fn card(parameters: &'static [Parameter]) -> Card {
     Card {
         id: "diffusion",
         statement: "Diffusion in the electrodes relaxes the voltage slowly, with the square root of time.",
-        equation: "v = −(1 − w)·i∗z − w·(OCV(SoC) − OCV(SoC − i∗z/m)), Z(s) = R·tanh(√(sτ))/√(sτ); w: ocv_share, 0 without it; m: mean slope of OCV from 20 to 80 %",
+        equation: "v = −(1 − w)·(k·i)∗z − w·(OCV(SoC) − OCV(SoC − (k·i)∗z/m)), Z(s) = R·tanh(√(sτ))/√(sτ); w: ocv_share, 0 without it; m: mean slope of OCV from 20 to 80 %; k: R/R25 as of temperature and state of charge (resistance-temperature, cell-self-heating, resistance-soc), 1 without them",
         parameters,
         shows: "very slow relaxation",
         looks_like: &["polarisation"],
@@ -95,8 +95,11 @@ impl Effect for Diffusion {
             weights.map(|share| share * ohms),
         );
         let share = values.get(2).copied().unwrap_or_default();
+        let cells = battery.base.cells;
+        let of_string = battery.base.ocv.iter();
+        let cell_ocv: Vec<(f64, f64)> = of_string.map(|(soc, v)| (*soc, v / cells)).collect();
         if share != 0.0
-            && let Some(slope_v) = middle_slope_v(&battery.base.ocv)
+            && let Some(slope_v) = middle_slope_v(&cell_ocv)
         {
             // The state of charge at the surface, where the reaction is.
             let surface: Vec<f64> = battery
@@ -105,8 +108,8 @@ impl Effect for Diffusion {
                 .zip(&drop)
                 .map(|(soc, drop)| soc - drop / slope_v)
                 .collect();
-            let inside_v = open_circuit_v(&battery.base.ocv, &battery.soc);
-            let surface_v = open_circuit_v(&battery.base.ocv, &surface);
+            let inside_v = open_circuit_v(&cell_ocv, &battery.soc);
+            let surface_v = open_circuit_v(&cell_ocv, &surface);
             for ((drop, inside), surface) in drop.iter_mut().zip(inside_v).zip(surface_v) {
                 *drop += share * (inside - surface - *drop);
             }

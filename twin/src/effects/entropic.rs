@@ -32,9 +32,8 @@ impl Effect for Entropic {
             && (problem.drive.cell_temperature_c.is_some() || problem.drive.ambient_c.is_some())
     }
 
-    fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
-        let most = MOST_V_PER_K * scale.cells;
-        (-most, most)
+    fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {
+        (-MOST_V_PER_K, MOST_V_PER_K)
     }
 
     fn starts(&self, _scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {

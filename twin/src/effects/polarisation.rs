@@ -36,7 +36,7 @@ const fn card(parameters: &'static [Parameter]) -> Card {
     Card {
         id: "polarisation",
         statement: "The voltage goes on falling after the ohmic step and recovers after it: RC branches that the simulation lacks.",
-        equation: "v = −Σₖ rₖ·iₖ, τₖ·diₖ/dt + iₖ = i",
+        equation: "v = −Σₖ rₖ·iₖ, τₖ·diₖ/dt + iₖ = k·i; k: R/R25 as of temperature and state of charge (resistance-temperature, cell-self-heating, resistance-soc), 1 without them",
         parameters,
         shows: "relaxation after steps",
         looks_like: &["diffusion", "ocv-hysteresis"],

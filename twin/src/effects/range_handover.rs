@@ -51,6 +51,9 @@ impl Effect for RangeHandover {
         let ratio = scene.sensor.map_or(0.0, |sensor| sensor.range_ratio);
         let ratio = if ratio > 0.0 { ratio } else { DEFAULT_RATIO };
         let tau_s = values[0];
+        if tau_s <= 0.0 {
+            return;
+        }
         let drive = scene.drive;
         let mut changes = scene.changes.iter().peekable();
         let held = scene.held();

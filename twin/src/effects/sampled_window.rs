@@ -23,7 +23,7 @@ pub struct SampledWindow;
 static CARD: Card = Card {
     id: "sampled-window",
     statement: "The sensor measures only the first part of each period and holds that mean until the next one.",
-    equation: "y = mean of i over the first duty·period of each period, held until the next (periods count from the recording's start)",
+    equation: "y = mean of i over the first duty·period of each period, held until the next (periods count from the operation's start plus a fitted phase, on over gaps)",
     parameters: &[
         Parameter::new("period_s", "s", 0.0, Search::Stepped),
         Parameter::new("duty", "1", 1.0, Search::Stepped)
@@ -72,12 +72,12 @@ impl Effect for SampledWindow {
 
     fn choices(&self, scale: &Scale) -> f64 {
         // Two a cycle of the beat that is resolved, up to one in two rows.
-        (scale.span_s / scale.even_s.max(1e-12)).max(1.0)
+        (scale.operation_s / scale.even_s.max(1e-12)).max(1.0)
     }
 
     fn near(&self, values: &[f64], scale: &Scale, share: f64) -> Option<Vec<Vec<f64>>> {
         let (period, duty, phase) = (values[0], values[1], values[2]);
-        let span = scale.span_s.max(period);
+        let span = scale.operation_s.max(period);
         let along = |by: [f64; 3]| {
             [share, -share].map(|share| {
                 let moved = values.iter().zip(by);
@@ -121,11 +121,15 @@ impl Effect for SampledWindow {
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (period, duty, phase) = (values[0], values[1], values[2]);
+        if period <= 0.0 {
+            return;
+        }
         let drive = scene.drive;
         let held = scene.held();
         let input = &scene.signal[..];
         let mut output = input.to_vec();
-        for rows in drive.segments.iter().filter(|rows| !rows.is_empty()) {
+        // The converter goes on while nothing is recorded: what flowed then is a straight line.
+        for rows in drive.operations().iter().filter(|rows| !rows.is_empty()) {
             let start = drive.t_s[rows.start] + phase;
             let mut cursor = Cursor::new(&drive.t_s, rows.clone());
             let (mut value, mut until) = (input[rows.start], f64::NEG_INFINITY);

@@ -42,12 +42,12 @@ pub struct Scale {
     pub begin_s: f64,
     /// Time covered in s; of the longest segment.
     pub span_s: f64,
+    /// Time from the begin to the end of the longest operation, gaps included, in s: what clocks run on for.
+    pub operation_s: f64,
     /// Capacity of the battery in Ah, 0 without one.
     pub capacity_ah: f64,
-    /// Ohmic resistance by design in Ω.
+    /// Ohmic resistance of one cell by design in Ω.
     pub resistance_ohm: f64,
-    /// Cells in series, 0 without a battery.
-    pub cells: f64,
     /// Averaging window by design in s.
     pub window_s: f64,
     /// The converter's step by design.
@@ -100,7 +100,7 @@ pub struct Battery<'a> {
     pub arrhenius_k: Option<f64>,
     /// Factor on every resistance.
     pub factor: Series,
-    /// Voltage added to open circuit and ohmic drop, in V.
+    /// Voltage of one cell added to its open circuit and ohmic drop, in V.
     pub added_v: Series,
 }
 
@@ -433,6 +433,11 @@ impl<'a> Cursor<'a> {
         }
     }
 
+    /// Over an operation, from a row of it on.
+    fn within(t_s: &'a [f64], rows: Range<usize>, at: usize) -> Self {
+        Self { t_s, rows, at }
+    }
+
     /// Moves so that `at` is the last row not after `t`.
     #[inline]
     fn seek(&mut self, t: f64) {
@@ -633,20 +638,30 @@ impl<'a> Scene<'a> {
         let mut sampled = vec![f64::NAN; observed.t_s.len()];
         let (skew, delay_s) = (1.0 + self.skew, self.delay_s);
         let mut known: (usize, Option<(f64, f64)>) = (usize::MAX, None);
+        let operations = drive.operation_of_each();
         // One stretch of readings after the other, each within one segment.
         for (segment, these) in observed.stretches.iter() {
             let rows = drive.segments.get(segment).cloned();
             let Some(rows) = rows.filter(|rows| !rows.is_empty()) else {
                 continue;
             };
-            let start = drive.t_s[rows.start];
+            // A clock runs on while nothing is recorded. What it points to in a gap lies on a straight line between the gap's ends.
+            let operation = operations[segment].clone();
+            let start = drive.t_s[operation.start];
+            // What the sensor's clock calls t was at this time.
+            let reference_s = |t: f64| start + (t - start) / skew - delay_s;
             // Rows of even steps: all of them move by the same part of a step.
             let even_rows = if observed.on_drive_rows && !held && total.is_none() {
                 (rows.start, rows.end)
             } else {
                 (0, 0)
             };
-            let mut cursor = Cursor::new(&drive.t_s, rows);
+            let around = if total.is_some() {
+                rows.clone()
+            } else {
+                operation.clone()
+            };
+            let mut cursor = Cursor::within(&drive.t_s, around, rows.start);
             let times = &observed.t_s[these.clone()];
             let values = &mut sampled[these.clone()];
             if let Some(Some(step_s)) = self.steps.even_s.get(segment)
@@ -656,12 +671,21 @@ impl<'a> Scene<'a> {
                 if skew == 1.0 {
                     moved(&self.signal[these], steps, values);
                 } else {
-                    stretched(&self.signal[these], 1.0 / skew, steps, values);
+                    // By how much the clock was off when the segment began.
+                    let before = (drive.t_s[rows.start] - start) / step_s * (1.0 - 1.0 / skew);
+                    stretched(&self.signal[these], 1.0 / skew, steps + before, values);
                 }
+                let ends_s = [drive.t_s[rows.start], drive.t_s[rows.end - 1]];
+                let ahead = (times.iter().zip(values.iter_mut()))
+                    .map(|(t, value)| (reference_s(*t), value))
+                    .take_while(|(t, _)| operation.start < rows.start && *t < ends_s[0]);
+                ahead.for_each(|(t, value)| *value = cursor.value(&self.signal, t, held));
+                let behind = (times.iter().zip(values.iter_mut()).rev())
+                    .map(|(t, value)| (reference_s(*t), value))
+                    .take_while(|(t, _)| rows.end < operation.end && *t > ends_s[1]);
+                behind.for_each(|(t, value)| *value = cursor.value(&self.signal, t, held));
                 continue;
             }
-            // What the sensor's clock calls t was at this time.
-            let reference_s = |t: f64| start + (t - start) / skew - delay_s;
             let Some(total) = &total else {
                 for (value, t) in values.iter_mut().zip(times) {
                     *value = cursor.value(&self.signal, reference_s(*t), held);
@@ -768,13 +792,14 @@ impl<'a> Battery<'a> {
     /// The voltage from everything, in place of the current: open circuit, ohmic drop and what was added.
     pub fn voltage(&self, signal: &mut [f64]) {
         let ohms = self.base.resistance_ohm * self.resistance;
+        let cells = self.base.cells;
         for (((value, open_v), factor), added_v) in signal
             .iter_mut()
             .zip(&self.open_circuit_v)
             .zip(&self.factor)
             .zip(&self.added_v)
         {
-            *value = open_v - ohms * factor * *value + added_v;
+            *value = open_v - ohms * factor * *value + cells * added_v;
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, sensing};
-use crate::problem::Problem;
+use crate::problem::{Base, Problem};
 
 /// Supply for which the sensor is rated, in V.
 const NOMINAL_V: f64 = 5.0;
@@ -16,7 +16,7 @@ pub struct SupplyRatiometric;
 static CARD: Card = Card {
     id: "supply-ratiometric",
     statement: "The output of the sensor follows its supply and the reference of the converter does not, or the reverse: zero and sensitivity move with the supply.",
-    equation: "y = i·(1 + (Vc/5 − 1)·ratio) + Z·(Vc/5 − 1)·ratio, Z = the current that 2.5 V stand for",
+    equation: "y = i·(1 + (Vc/5 − 1)·ratio) + Z·(Vc/5 − 1)·ratio, Z = 1.25·full scale, the current that 2.5 V stand for; only where the full scale is known",
     parameters: &[Parameter::new("ratio", "1", 0.0, Search::Linear)],
     shows: "follows the supply of the sensor",
     looks_like: &["offset"],
@@ -30,7 +30,9 @@ impl Effect for SupplyRatiometric {
     }
 
     fn applies(&self, problem: &Problem) -> bool {
-        sensing(problem) && problem.drive.supply_v.is_some()
+        // Without the full scale nobody knows what current the zero stands for, and that moves more than the sensitivity does.
+        let ranged = matches!(&problem.base, Base::Sensor(sensor) if sensor.full_scale.is_some());
+        sensing(problem) && problem.drive.supply_v.is_some() && ranged
     }
 
     fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {

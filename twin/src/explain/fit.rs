@@ -42,7 +42,7 @@ const WORTH: f64 = 0.1;
 
 /// What the model file says of the base is off by this many of its own standard uncertainties at most: beyond them it is no
 /// uncertainty but physics that was left out, and has a name.
-const BASE_OFF: f64 = 4.0;
+pub(super) const BASE_OFF: f64 = 4.0;
 
 /// A fit of more rows than this does not keep its slope: memory stays linear in the recording, with a small factor.
 const KEPT_ROWS: usize = 40_000;

@@ -5,6 +5,7 @@ use rayon::prelude::*;
 use super::fit::{Fit, change, dot, fit, held_out, huber, loss, polish};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
 use super::shape::without_memory;
+use super::told::short;
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search, Stage, find};
 
@@ -587,11 +588,8 @@ fn small(
         all = all.min(apart(bench, &before.predicted, &after.predicted));
     }
     if all < beside {
-        return Some(format!(
-            "{:.2} rms, which the equations of the others may be off by ({:.2})",
-            (all / bench.len() as f64).sqrt(),
-            (beside / bench.len() as f64).sqrt()
-        ));
+        let [all, beside] = [all, beside].map(|energy| (energy / bench.len() as f64).sqrt());
+        return Some(within_others(all, beside, &bench.problem.unit));
     }
     let deviations = bench.deviations(&change);
     if deviations < CERTAIN {
@@ -611,12 +609,22 @@ fn small(
     }
     if size < accuracy {
         return Some(format!(
-            "its size, {:.3} rms, is within what reference and time stamps are accurate to, {:.3}",
-            f64::sqrt(size / rows),
-            f64::sqrt(accuracy / rows)
+            "its size, {} {unit} rms, is within what reference and time stamps are accurate to, {} {unit}",
+            short(f64::sqrt(size / rows)),
+            short(f64::sqrt(accuracy / rows)),
+            unit = bench.problem.unit
         ));
     }
     None
+}
+
+/// Why a size is none beside others whose equations may be off by more.
+fn within_others(rms: f64, others: f64, unit: &str) -> String {
+    format!(
+        "{} {unit} rms, which the equations of the others may be off by ({} {unit})",
+        short(rms),
+        short(others)
+    )
 }
 
 /// Whether another effect cuts or rounds what one gives.
@@ -1183,5 +1191,17 @@ pub fn percent(share: f64) -> String {
         format!("{:.3} %", 100.0 * share).replace(".000 %", " %")
     } else {
         "more than any".into()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_size_in_volts_is_told_in_volts() {
+        let said = within_others(0.00123, 0.004567, "V");
+        assert!(said.starts_with("0.00123 V rms"), "{said}");
+        assert!(said.ends_with("(0.00457 V)"), "{said}");
     }
 }

@@ -1,6 +1,6 @@
 //! What the report says of one signal: its effects, its places, its plots and its sentence.
 
-use super::fit::Fit;
+use super::fit::{BASE_OFF, Fit};
 use super::flexible::Explainable;
 use super::select::{Selection, percent};
 use super::workbench::{Member, Workbench};
@@ -217,7 +217,12 @@ pub(super) fn sentence(
                 }) =>
         {
             format!(
-                "{name}: no physics is left out, but {found} than stated, within what the model file leaves open ({figures})."
+                "{name}: no physics is left out, but {found} than stated, {} what the model file leaves open ({figures}).",
+                if at_limit(selection.fit.model.nuisance, &bench.problem.base) {
+                    "at the end of"
+                } else {
+                    "within"
+                }
             )
         }
         Verdict::NoMismatch => format!(
@@ -256,10 +261,28 @@ pub(super) fn sentence(
 
 /// What was found of a battery within what the model file leaves open: it is no physics that was left out, and part of every error
 /// after it.
-pub(super) fn base_found(name: &str, nuisance: Nuisance) -> Option<String> {
+pub(super) fn base_found(name: &str, nuisance: Nuisance, base: &Base) -> Option<String> {
     base_differs(nuisance).map(|found| {
-        format!("{name}: within what the model file leaves open, {found} than stated fits; the errors after are with that")
+        if at_limit(nuisance, base) {
+            format!(
+                "{name}: {found} than stated is as far as the model file allows ({BASE_OFF} standard uncertainties), and more would fit \
+                 better: what is stated is off by more, or something else makes it look so; the errors after are with that"
+            )
+        } else {
+            format!("{name}: within what the model file leaves open, {found} than stated fits; the errors after are with that")
+        }
     })
+}
+
+/// Whether what a battery is found to be off by stands at the end of what the model file allows.
+fn at_limit(nuisance: Nuisance, base: &Base) -> bool {
+    let Base::Battery(base) = base else {
+        return false;
+    };
+    let ends =
+        |found: f64, sigma: f64| sigma > 0.0 && found.abs() >= BASE_OFF * sigma * (1.0 - 1e-9);
+    ends(nuisance.soc_shift, base.initial_soc_sigma)
+        || ends(nuisance.resistance, base.resistance_sigma)
 }
 
 /// By what the battery as designed differs, if by more than [`TOLD_PERCENT`].
@@ -345,6 +368,7 @@ pub(super) fn short(value: f64) -> String {
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+    use crate::problem::BatteryBase;
 
     #[test]
     fn what_a_battery_was_off_by_is_told_if_it_matters() {
@@ -354,7 +378,12 @@ mod tests {
                 soc_shift,
                 ..Nuisance::default()
             };
-            base_found("v_cell_v", nuisance)
+            let base = Base::Battery(BatteryBase {
+                initial_soc_sigma: 0.01,
+                resistance_sigma: 0.1,
+                ..BatteryBase::default()
+            });
+            base_found("v_cell_v", nuisance, &base)
         };
         assert_eq!(found(4e-4, -4e-4), None);
         let said = found(0.273, -0.0071).unwrap();
@@ -363,5 +392,15 @@ mod tests {
             said.contains("start 0.710 points of per cent lower"),
             "{said}"
         );
+        assert!(
+            said.contains("within what the model file leaves open"),
+            "{said}"
+        );
+        // Four times what is stated is the end.
+        for said in [found(0.273, -0.04), found(0.4, 0.0)] {
+            let said = said.unwrap();
+            assert!(said.contains("as far as the model file allows"), "{said}");
+            assert!(!said.contains("than stated fits"), "{said}");
+        }
     }
 }

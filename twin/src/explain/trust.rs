@@ -7,7 +7,7 @@ use super::told::short;
 use super::unfitted::{Unfitted, confirmed};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::scene::Scale;
-use crate::effects::{IDEALISED, Search, find};
+use crate::effects::{IDEALISED, Parameter, Search, find};
 use crate::problem::Base;
 
 /// An effect whose values would have to differ from stretch to stretch by so many times what equations may be off by (14 % of it,
@@ -228,14 +228,17 @@ fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<Stri
             ));
         }
     }
-    let sizes: Vec<_> = known()
-        .filter(|(_, (parameter, _))| {
-            parameter.search == Search::Linear && parameter.off.is_finite()
-        })
-        .collect();
-    let none = |(parameter, [low, high]): (&crate::effects::Parameter, &[f64; 2])| {
-        (*low..=*high).contains(&parameter.off)
+    // At 0 there is none of it; a knee or a frequency is where it is, and none at no value.
+    let is_size = |parameter: &Parameter| match parameter.search {
+        Search::Linear => parameter.off.is_finite(),
+        Search::Smooth => parameter.off == 0.0 && !parameter.open,
+        Search::Logarithmic | Search::Stepped => false,
     };
+    let sizes: Vec<_> = known()
+        .filter(|(_, (parameter, _))| is_size(parameter))
+        .collect();
+    let none =
+        |(parameter, [low, high]): (&Parameter, &[f64; 2])| (*low..=*high).contains(&parameter.off);
     (!sizes.is_empty() && sizes.iter().all(|(_, pair)| none(*pair))).then(|| {
         format!(
             "{} could as well be {}",
@@ -280,6 +283,20 @@ mod tests {
         // One size is enough.
         assert_eq!(says("range-mismatch", &[[1.01, 1.02], [-0.1, 0.1]]), None);
         assert!(says("range-mismatch", &[[0.99, 1.02], [-0.1, 0.1]]).is_some());
+        // Nor is a size that is searched for otherwise.
+        let heat = says("cell-self-heating", &[[0.0, 17.7], [100.0, 300.0]]);
+        assert!(heat.unwrap().contains("rth_k_per_w could as well be 0"));
+        assert_eq!(
+            says("cell-self-heating", &[[5.0, 17.7], [100.0, 300.0]]),
+            None
+        );
+        assert!(says("clock-skew", &[[-30.0, 200.0]]).is_some());
+        assert_eq!(says("clock-skew", &[[150.0, 250.0]]), None);
+        assert!(says("delay", &[[-0.1, 0.1]]).is_some());
+        assert!(says("resistance-temperature", &[[-200.0, 900.0]]).is_some());
+        // What is a place is none at no value.
+        assert!(says("resistance-soc", &[[-0.1, 0.3], [0.2, 0.25]]).is_some());
+        assert_eq!(says("resistance-soc", &[[0.5, 1.0], [0.2, 0.4]]), None);
         assert!(says("coulombic-efficiency", &[[-1.0, 12.0]]).is_some());
         assert_eq!(says("coulombic-efficiency", &[[0.97, 0.99]]), None);
         assert_eq!(says("lag", &[[0.1, 0.4]]), None);

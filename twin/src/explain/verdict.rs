@@ -22,6 +22,8 @@ const SLOW: f64 = 10.0;
 const COMMON: (f64, f64) = (0.8, 1.2816);
 /// Times the stated noise that noise never is.
 const STRAY: f64 = 8.0;
+/// Up to this share of the readings they are rare.
+const RARE: f64 = 0.01;
 /// Fewer readings beyond it are not told from a slip of the log.
 const STRAYS: usize = 2;
 /// Those readings are the mismatch if they make this share of its energy.
@@ -294,26 +296,40 @@ fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
 }
 
 /// What is to be said of readings that no noise makes and that nothing accounts for, where they decide nothing.
-pub(super) fn slips(read: &Workbench<'_>, shown: &Fit) -> Option<String> {
+pub(super) fn slips(read: &Workbench<'_>, shown: &Fit, verdict: Verdict) -> Option<String> {
     // Behind what cuts or rounds, noise is not what the model file states.
     let cuts = |member: &Member| member.effect.cuts();
     if read.problem.noise <= 0.0 || shown.model.members.iter().any(cuts) {
         return None;
     }
     let strays = strays(read, &shown.residual)?;
+    let why = why_astray(strays.count as f64 / read.len() as f64, verdict)?;
     let of_what = if shown.model.members.is_empty() {
         ""
     } else {
         " after all that is named"
     };
     Some(format!(
-        "{}: {} off by more than {STRAY} times the stated noise{of_what}, the worst by {} {} at {} s: a slip of the log, or something too rare here to name",
+        "{}: {} off by more than {STRAY} times the stated noise{of_what}, the worst by {} {} at {} s: {why}",
         read.problem.name,
         strays.counted(),
         short(strays.largest),
         read.problem.unit,
         short(strays.at_s),
     ))
+}
+
+/// What such a share of the readings can be. Nothing, where the verdict says that much is left: they are it.
+fn why_astray(share: f64, verdict: Verdict) -> Option<&'static str> {
+    if share <= RARE {
+        Some("a slip of the log, or something too rare here to name")
+    } else if verdict == Verdict::PartlyExplained {
+        None
+    } else {
+        Some(
+            "too many to be slips of the log; their noise is not the stated one, or what makes it is not in the library",
+        )
+    }
 }
 
 /// The least energy that the design lets be left: what is unavoidable, or the reference's own zero and the readings' steps.
@@ -460,4 +476,18 @@ fn quantile(series: &[f64], share: f64) -> f64 {
     sizes.sort_unstable_by(f64::total_cmp);
     let at = (sizes.len() as f64 * share) as usize;
     sizes.get(at).copied().unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_rare_is_not_called_rare() {
+        let rare = |share, verdict| why_astray(share, verdict).map(|why| why.contains("too rare"));
+        assert_eq!(rare(2.0 / 3600.0, Verdict::Explained), Some(true));
+        assert_eq!(rare(2.0 / 3600.0, Verdict::PartlyExplained), Some(true));
+        assert_eq!(rare(2448.0 / 3600.0, Verdict::Explained), Some(false));
+        assert_eq!(rare(2448.0 / 3600.0, Verdict::PartlyExplained), None);
+    }
 }

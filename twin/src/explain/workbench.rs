@@ -601,6 +601,12 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         .filter(|rows| !rows.is_empty())
         .map(|rows| drive.t_s[rows.end - 1] - drive.t_s[rows.start])
         .fold(0.0, f64::max);
+    let operation_s = drive
+        .operations()
+        .into_iter()
+        .filter(|rows| !rows.is_empty())
+        .map(|rows| drive.t_s[rows.end - 1] - drive.t_s[rows.start])
+        .fold(0.0, f64::max);
     let mut scale = Scale {
         largest,
         both_ways: both_ways(drive, largest),
@@ -618,6 +624,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         fastest_s: 0.02 * step_s.min(reading_step_s),
         begin_s: problem.observed.t_s.first().copied().unwrap_or_default(),
         span_s,
+        operation_s,
         ..Scale::default()
     };
     if problem.view == View::Charge {
@@ -633,8 +640,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         }
         Base::Battery(base) => {
             scale.capacity_ah = base.capacity_ah;
-            scale.resistance_ohm = base.resistance_ohm;
-            scale.cells = base.cells;
+            scale.resistance_ohm = base.resistance_ohm / base.cells;
         }
     }
     scale
