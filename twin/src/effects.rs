@@ -26,7 +26,7 @@ mod offset;
 mod offset_temperature;
 mod parasitic_load;
 mod polarisation;
-mod quantisation;
+pub(crate) mod quantisation;
 mod range_handover;
 mod range_mismatch;
 mod resistance_soc;

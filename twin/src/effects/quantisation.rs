@@ -2,6 +2,7 @@
 
 use super::scene::{Scale, Scene, rounded};
 use super::{Card, Clues, Effect, Mark, Parameter, Search, Stage};
+use crate::problem::{Problem, View};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -21,6 +22,11 @@ static CARD: Card = Card {
 impl Effect for Quantisation {
     fn card(&self) -> &'static Card {
         &CARD
+    }
+
+    /// A counter's step is of charge and its remainder is kept: rounding a mean current would lose that.
+    fn applies(&self, problem: &Problem) -> bool {
+        problem.view == View::Sensor
     }
 
     fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
@@ -89,9 +95,17 @@ fn lattice(observed: &[f64]) -> Vec<f64> {
         .collect();
     sorted.sort_unstable_by(f64::total_cmp);
     sorted.dedup();
-    // A grid repeats values, and two readings on it differ by its step or a multiple.
+    // A grid repeats values.
     if sorted.len() < 4 || sorted.len() * 3 > observed.len() {
         return Vec::new();
+    }
+    grid(&sorted).into_iter().collect()
+}
+
+/// The step of a grid on which nearly all of some values lie, which ascend: two on it differ by its step or a multiple.
+pub(crate) fn grid(sorted: &[f64]) -> Option<f64> {
+    if sorted.len() < 2 {
+        return None;
     }
     let mut gaps: Vec<f64> = sorted.windows(2).map(|pair| pair[1] - pair[0]).collect();
     gaps.sort_unstable_by(f64::total_cmp);
@@ -107,8 +121,6 @@ fn lattice(observed: &[f64]) -> Vec<f64> {
         .map(|share| least * (1.0 + share))
         .max_by(|a, b| concentration(*a).total_cmp(&concentration(*b)));
     best.filter(|step| concentration(*step) > ON_GRID)
-        .into_iter()
-        .collect()
 }
 
 /// How well values keep to a grid of a step, 0 … 1: the mean of unit vectors at their place within a step.
