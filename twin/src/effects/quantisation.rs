@@ -34,6 +34,10 @@ impl Effect for Quantisation {
     }
 
     fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        // What the readings show by themselves is no choice.
+        if let Some(mark) = self.mark(scale, clues) {
+            return vec![mark.values];
+        }
         // Noise behind the staircase hides the grid of the readings: the residual still goes with the stairs.
         by_correlation(clues, scale)
             .map(|step| vec![step])
@@ -45,8 +49,14 @@ impl Effect for Quantisation {
         let step = lattice(clues.observed)
             .into_iter()
             .find(|step| *step > 1.5 * scale.quantum)?;
+        let known = clues.observed.iter().filter(|y| y.is_finite());
+        let (low, high) = known.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), y| {
+            (low.min(*y), high.max(*y))
+        });
         Some(Mark {
             values: vec![step],
+            // Over all of the readings the grid stays in step.
+            within: vec![IN_STEP * step * step / (high - low).max(step)],
             // Evenly spread over a step.
             variance: step * step / 12.0,
         })
@@ -81,6 +91,8 @@ impl Effect for Quantisation {
 const ENOUGH: usize = 4000;
 /// Concentration from which on values are on a grid: what is off it is less than a twentieth of a step.
 const ON_GRID: f64 = 0.95;
+/// A grid is told to this share of a step over the span of the readings.
+const IN_STEP: f64 = 0.1;
 /// A gap is this share off the step at most.
 const OFF: f64 = 0.2;
 /// Sums that are kept side by side.
@@ -113,7 +125,7 @@ pub(crate) fn grid(sorted: &[f64]) -> Option<f64> {
     let span = sorted[sorted.len() - 1] - sorted[0];
     let concentration = |step: f64| concentration(sorted.iter().copied(), step);
     // The gap is known to rounding only: over the span the grid has to stay in step.
-    let fine = 0.1 * least / span.max(least);
+    let fine = IN_STEP * least / span.max(least);
     let best = (-200..=200)
         .map(|k| f64::from(k) * fine)
         // Half of a step is a grid of the same readings: a coarse one must not be led there.
