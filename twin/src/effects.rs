@@ -387,6 +387,8 @@ pub trait Effect: Sync {
 pub struct Mark {
     /// A value for each of its parameters.
     pub values: Vec<f64>,
+    /// How far each of them may be off.
+    pub within: Vec<f64>,
     /// Variance that it adds to the residual, in the view's unit squared.
     pub variance: f64,
 }

@@ -848,3 +848,48 @@ fn a_constant_in_slow_noise_is_constant() {
         );
     }
 }
+
+/// Readings that are rounded down: by the nearest step, with an offset of half of one. At rest the current is right on an edge.
+#[test]
+fn steps_that_are_cut_off_keep_their_size() {
+    for (seed, step_a) in [(60, 8.0), (61, 8.0), (62, 8.0)] {
+        let mut truth = truth();
+        for (row, current_a) in truth.current_a.iter_mut().enumerate() {
+            // A rest in each third.
+            if row % 900 < 300 {
+                *current_a = 0.0;
+            }
+        }
+        let mut noise = noise(seed, 0.05 * step_a);
+        let seen = truth.current_a.iter().map(|i| i + noise());
+        let reading = seen.map(|x| step_a * (x / step_a).floor()).collect();
+        let problem = Problem {
+            noise: 0.0,
+            ..problem_of(&truth, reading, Coloured::default())
+        };
+        let report = said(problem, seed, &[]);
+        for effect in &report.effects {
+            for parameter in effect.parameters.iter().filter(|p| p.name == "step_a") {
+                assert!((parameter.value - step_a).abs() < 1e-3, "{effect:?}");
+                let [low, high] = parameter.ci95;
+                assert!(
+                    low > 0.99 * step_a && low <= step_a && high >= step_a && high < 1.01 * step_a,
+                    "{effect:?}"
+                );
+            }
+            for parameter in effect.parameters.iter().filter(|p| p.name == "offset_a") {
+                assert!(
+                    (parameter.value + 0.5 * step_a).abs() < 0.1 * step_a,
+                    "{effect:?}"
+                );
+            }
+        }
+        let signal = &report.signals[0];
+        assert!(
+            signal.rmse_after <= signal.rmse_before,
+            "{:?} {:?}",
+            report.verdict,
+            report.decisions
+        );
+    }
+}

@@ -317,6 +317,70 @@ fn a_counter_becomes_mean_currents_and_a_reset_cuts() {
     }
 }
 
+/// A counter of a drive: what it counts in floor steps, of a current at 10 rows a second.
+fn counted(step_c: f64, current_a: impl Fn(f64) -> f64) -> (Problem, Vec<String>) {
+    let mut charge = 0.0;
+    let rows: Vec<Vec<f64>> = (0..6000)
+        .map(|k| {
+            let t = f64::from(k) * 0.1;
+            let row = vec![
+                t,
+                current_a(t),
+                if step_c > 0.0 {
+                    step_c * (charge / step_c).floor()
+                } else {
+                    charge
+                },
+            ];
+            charge += 0.1 * 0.5 * (current_a(t) + current_a(t + 0.1));
+            row
+        })
+        .collect();
+    let model = "schema = 1\n[sensor]\n[charge]\n";
+    one(model, &text("t_s,i_ref_a,q_meas_c", rows.into_iter()))
+}
+
+#[test]
+fn a_step_that_a_counter_shows_is_taken_as_stated() {
+    let drive = |t: f64| 20.0 + 30.0 * (0.11 * t).sin() + 15.0 * (0.7 * t).sin();
+    let (problem, remarks) = counted(10.0, drive);
+    assert!(
+        remarks
+            .iter()
+            .any(|remark| remark.contains("steps of 10 C")),
+        "{remarks:?}"
+    );
+    let Base::Sensor(base) = &problem.base else {
+        panic!("a sensor");
+    };
+    assert!((base.step - 10.0).abs() < 1e-6, "{}", base.step);
+    // Even over a step at both ends.
+    let noise = (2.0 * 10.0_f64.powi(2) / 12.0).sqrt();
+    assert!(
+        (problem.noise / noise - 1.0).abs() < 1e-6,
+        "{}",
+        problem.noise
+    );
+    let report = twin::explain::explain(
+        &[problem],
+        &[],
+        &twin::explain::Options::default(),
+        &mut |_, _| (),
+    );
+    assert_eq!(report.verdict, twin::report::data::Verdict::NoMismatch);
+    // Even levels of a current move a counter without steps by even amounts.
+    for smooth in [
+        counted(0.0, drive),
+        counted(0.0, |t| 10.0 * (t / 60.0).floor()),
+    ] {
+        assert!(
+            smooth.1.iter().all(|remark| !remark.contains("steps of")),
+            "{:?}",
+            smooth.1
+        );
+    }
+}
+
 const BATTERY: &str = "schema = 1\n[battery]\ncapacity_ah = 1\nocv = [[0, 3.0], [1, 4.0]]\nohmic_resistance_ohm = 0.01\n";
 
 fn discharge(counter: bool) -> String {

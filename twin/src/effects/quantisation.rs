@@ -2,6 +2,7 @@
 
 use super::scene::{Scale, Scene, rounded};
 use super::{Card, Clues, Effect, Mark, Parameter, Search, Stage};
+use crate::problem::{Problem, View};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -23,11 +24,20 @@ impl Effect for Quantisation {
         &CARD
     }
 
+    /// A counter's step is of charge and its remainder is kept: rounding a mean current would lose that.
+    fn applies(&self, problem: &Problem) -> bool {
+        problem.view == View::Sensor
+    }
+
     fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
         (0.0, 0.5 * scale.full_scale)
     }
 
     fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        // What the readings show by themselves is no choice.
+        if let Some(mark) = self.mark(scale, clues) {
+            return vec![mark.values];
+        }
         // Noise behind the staircase hides the grid of the readings: the residual still goes with the stairs.
         by_correlation(clues, scale)
             .map(|step| vec![step])
@@ -39,8 +49,14 @@ impl Effect for Quantisation {
         let step = lattice(clues.observed)
             .into_iter()
             .find(|step| *step > 1.5 * scale.quantum)?;
+        let known = clues.observed.iter().filter(|y| y.is_finite());
+        let (low, high) = known.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), y| {
+            (low.min(*y), high.max(*y))
+        });
         Some(Mark {
             values: vec![step],
+            // Over all of the readings the grid stays in step.
+            within: vec![IN_STEP * step * step / (high - low).max(step)],
             // Evenly spread over a step.
             variance: step * step / 12.0,
         })
@@ -75,6 +91,8 @@ impl Effect for Quantisation {
 const ENOUGH: usize = 4000;
 /// Concentration from which on values are on a grid: what is off it is less than a twentieth of a step.
 const ON_GRID: f64 = 0.95;
+/// A grid is told to this share of a step over the span of the readings.
+const IN_STEP: f64 = 0.1;
 /// A gap is this share off the step at most.
 const OFF: f64 = 0.2;
 /// Sums that are kept side by side.
@@ -89,9 +107,17 @@ pub(crate) fn lattice(observed: &[f64]) -> Vec<f64> {
         .collect();
     sorted.sort_unstable_by(f64::total_cmp);
     sorted.dedup();
-    // A grid repeats values, and two readings on it differ by its step or a multiple.
+    // A grid repeats values.
     if sorted.len() < 4 || sorted.len() * 3 > observed.len() {
         return Vec::new();
+    }
+    grid(&sorted).into_iter().collect()
+}
+
+/// The step of a grid on which nearly all of some values lie, which ascend: two on it differ by its step or a multiple.
+pub(crate) fn grid(sorted: &[f64]) -> Option<f64> {
+    if sorted.len() < 2 {
+        return None;
     }
     let mut gaps: Vec<f64> = sorted.windows(2).map(|pair| pair[1] - pair[0]).collect();
     gaps.sort_unstable_by(f64::total_cmp);
@@ -99,7 +125,7 @@ pub(crate) fn lattice(observed: &[f64]) -> Vec<f64> {
     let span = sorted[sorted.len() - 1] - sorted[0];
     let concentration = |step: f64| concentration(sorted.iter().copied(), step);
     // The gap is known to rounding only: over the span the grid has to stay in step.
-    let fine = 0.1 * least / span.max(least);
+    let fine = IN_STEP * least / span.max(least);
     let best = (-200..=200)
         .map(|k| f64::from(k) * fine)
         // Half of a step is a grid of the same readings: a coarse one must not be led there.
@@ -107,8 +133,6 @@ pub(crate) fn lattice(observed: &[f64]) -> Vec<f64> {
         .map(|share| least * (1.0 + share))
         .max_by(|a, b| concentration(*a).total_cmp(&concentration(*b)));
     best.filter(|step| concentration(*step) > ON_GRID)
-        .into_iter()
-        .collect()
 }
 
 /// How well values keep to a grid of a step, 0 … 1: the mean of unit vectors at their place within a step.

@@ -407,6 +407,24 @@ pub fn in_the_mean(bench: &Workbench<'_>, from: Fit) -> Fit {
     best
 }
 
+/// What a residual says of what is ahead of a grid: the least that it has to move by for each reading to be the one that was read.
+/// Next to an edge a hair is a step.
+pub fn ahead_of_grid(bench: &Workbench<'_>, fit: &Fit) -> Vec<f64> {
+    let grids = fit.model.members.iter();
+    let half = grids
+        .filter(|member| member.effect.rounds())
+        .map(|member| 0.5 * member.values[0])
+        .fold(0.0, f64::max);
+    match unrounded(bench, &fit.model) {
+        Some((_, predicted)) => bench
+            .residual(&predicted)
+            .iter()
+            .map(|r| r - r.clamp(-half, half))
+            .collect(),
+        None => fit.residual.clone(),
+    }
+}
+
 /// The model with nothing rounded, and what it says, if it rounds: a small step of a value ahead of a grid moves hardly any
 /// reading, and those by a whole step of the grid.
 fn unrounded(bench: &Workbench<'_>, model: &Model) -> Option<(Model, Vec<f64>)> {
@@ -795,7 +813,7 @@ fn search_steps(aim: Aim<'_, '_>, here: &mut Point, again: bool) -> bool {
             .filter(|p| parameters[*p].search == Search::Stepped)
             .filter(|p| here.model.held != Some((m, *p)))
             .collect();
-        if stepped.is_empty() {
+        if stepped.is_empty() || aim.bench.shown(member).is_some() {
             continue;
         }
         let together = effect.near(&member.values, &aim.bench.scale, 0.0).is_some();

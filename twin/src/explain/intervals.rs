@@ -351,6 +351,9 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit, beside: f64) -> Vec<Vec<[f64;
                 .enumerate()
                 .map(|(p, parameter)| {
                     let value = member.values[p];
+                    if let Some(within) = bench.shown(member) {
+                        return [value - within[p], value + within[p]];
+                    }
                     let at = slope.index(m, p);
                     if parameter.search == Search::Stepped || member.effect.kinked(p) {
                         if parameter.internal || !value.is_finite() {

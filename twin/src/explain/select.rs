@@ -265,6 +265,10 @@ fn marked(
     let mut now = now;
     for effect in bench.library.iter().copied() {
         let card = effect.card();
+        let mut members = now.model.members.iter();
+        if members.any(|member| member.id() == card.id && bench.shown(member).is_some()) {
+            continue;
+        }
         let as_read = bench.as_read(&now.predicted);
         let Some(mark) = effect.mark(&bench.scale, &bench.clues(&as_read)) else {
             continue;
@@ -278,16 +282,25 @@ fn marked(
         if gain < FLOOR {
             continue;
         }
-        decisions.push(format!(
-            "{} added: the readings lie on a grid; its steps make {} of the residual's energy.",
-            card.id,
-            percent(gain)
-        ));
         let smooth = missed(bench, fit(bench, &base, None));
         let model = smooth.model.with(Member {
             effect,
             values: mark.values,
         });
+        // The other values are those of the smooth simulation: steps have no slope to fit by.
+        let stepped = Fit::of(bench, model.clone(), smooth.cost);
+        if loss(&stepped.residual, now.sigma) >= loss(&now.residual, now.sigma) {
+            decisions.push(format!(
+                "{} not added, though the readings lie on a grid: with its steps the error is no smaller.",
+                card.id
+            ));
+            continue;
+        }
+        decisions.push(format!(
+            "{} added: the readings lie on a grid; its steps make {} of the residual's energy.",
+            card.id,
+            percent(gain)
+        ));
         let kept: Vec<Named> = named
             .iter()
             .filter_map(|one| {
@@ -306,8 +319,7 @@ fn marked(
             placebo_p99: 0.0,
             equivalent: Vec::new(),
         });
-        // The other values are those of the smooth simulation: steps have no slope to fit by.
-        now = Fit::of(bench, model, smooth.cost);
+        now = stepped;
     }
     (now, named)
 }

@@ -5,7 +5,7 @@
 //! keeps its colour). What the free curve still finds is set against what *that effect* takes, not against the whole: a wrong
 //! shape can take most of a mismatch and leave little.
 
-use super::fit::{self, Fit, change, dot, normal, solve};
+use super::fit::{self, Fit, ahead_of_grid, change, dot, normal, solve};
 use super::flexible::Features;
 use super::select::{Selection, percent};
 use super::workbench::Workbench;
@@ -132,11 +132,12 @@ fn misfit(
     let own = &fit.slope(bench).columns;
     let mut free = hats.to_vec();
     clean(&mut free, own);
-    let missed = Features::of(bench, &free).explain(&fit.residual, seed);
+    let residual = ahead_of_grid(bench, fit);
+    let missed = Features::of(bench, &free).explain(&residual, seed);
     if missed.share <= CERTAIN * missed.placebo_most {
         return None;
     }
-    let left = missed.share * dot(&fit.residual, &fit.residual);
+    let left = missed.share * dot(&residual, &residual);
     let known = bench.problem.accuracy;
     let accuracy: f64 = bench
         .plain

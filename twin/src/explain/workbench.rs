@@ -12,7 +12,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 use super::whiten::Whitening;
 use crate::effects::chain::{Begun, Chain, Change, Nuisance, Variation};
 use crate::effects::scene::{ROUNDS, Scale};
-use crate::effects::{Clues, Effect, LIBRARY, Parameter, Stage, find_with};
+use crate::effects::{Clues, Effect, LIBRARY, Mark, Parameter, Stage, find_with};
 use crate::problem::{Base, Coloured, Drive, Problem, View};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row).
@@ -116,6 +116,8 @@ pub struct Workbench<'a> {
     pub modelled: f64,
     /// Fits that were made: from which model to which, with spread and loss.
     known: Mutex<HashMap<Key, (Model, f64, f64)>>,
+    /// What the readings show by themselves, by effect.
+    shown: Vec<(&'static str, Mark)>,
     /// Makes the stated noise white, with the readings after it.
     white: Option<(Whitening, Vec<f64>)>,
 }
@@ -186,7 +188,7 @@ impl<'a> Workbench<'a> {
         };
         let scale = scale(problem, &t_s, &y, &plain);
         let blocks = blocks(&rows);
-        let library = LIBRARY
+        let library: Vec<&'static dyn Effect> = LIBRARY
             .iter()
             .copied()
             .filter(|effect| {
@@ -198,10 +200,20 @@ impl<'a> Workbench<'a> {
                     && !problem.modelled.iter().any(|(known, _)| *known == id)
             })
             .collect();
+        let clues = Clues {
+            t_s: &t_s,
+            observed: &y,
+            predicted: &plain,
+        };
+        let shown = library
+            .iter()
+            .filter_map(|effect| Some((effect.card().id, effect.mark(&scale, &clues)?)))
+            .collect();
         Self {
             problem,
             chain,
             scale,
+            shown,
             modelled,
             rows,
             t_s,
@@ -233,9 +245,18 @@ impl<'a> Workbench<'a> {
             blocks: self.blocks.clone(),
             library: self.library.clone(),
             modelled: self.modelled,
+            shown: self.shown.clone(),
             known: Mutex::default(),
             white: Some((whitening, y)),
         })
+    }
+
+    /// How far the values of an effect may be off, if they are those that the readings show by themselves: no fit moves them.
+    pub fn shown(&self, member: &Member) -> Option<&[f64]> {
+        let shown = self.shown.iter().find(|(id, _)| *id == member.id());
+        let mark = shown.map(|(_, mark)| mark);
+        mark.filter(|mark| mark.values == member.values)
+            .map(|mark| mark.within.as_slice())
     }
 
     /// Whether the noise was made white.

@@ -6,10 +6,14 @@ use core_logic::design_parameters::METER_POLL_MS;
 
 use super::{FEWEST_ROWS, Item, Purpose, Work, checks, phase, series};
 use crate::{
-    effects::scene::Cursor,
+    effects::{
+        quantisation::grid,
+        scene::{Cursor, integral},
+    },
     failure::Failure,
     model::Sensor,
     problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View},
+    report::format::at_most,
     simulate::board::{Board, Pace},
 };
 
@@ -21,6 +25,16 @@ const INTERVAL_S: f64 = 1.0;
 const TICK_S: f64 = METER_POLL_MS as f64 * 0.5e-3;
 /// A mean current this many times beyond the largest reference is no charge but a counter that was set anew.
 const RESET: f64 = 3.0;
+
+/// Differences of readings are the same within this share of the largest reading.
+const SAME: f64 = 1e-9;
+/// Readings of a counter with steps move by each of their amounts so often, in the mean.
+const REPEATED: usize = 3;
+/// A counter with steps strays from the charge by at least this share of a step in the middle of its readings (evenly spread
+/// remainders at both ends: 0.29).
+const KEPT: f64 = 0.05;
+/// A step below this share of what the counter moves by is fine enough to be none.
+const FINE: f64 = 1e-3;
 
 /// The problem of the counter; `None` where nothing is to be compared.
 pub(super) fn item(
@@ -38,7 +52,6 @@ pub(super) fn item(
     }
     checks::some_values(value, column, work.frame.source())?;
     let spec = work.model.charge.clone().unwrap_or_default();
-    let step_c = board.map_or(spec.step_c, Board::charge_step_c);
     let every = vec![true; value.len()];
     let (mut readings, rows) = match &work.clock {
         Some(clock) => series::own_rows(drive, clocks, work.frame.clocks(), clock, value, &every),
@@ -54,6 +67,17 @@ pub(super) fn item(
     // What the counter said then.
     readings.t_s.iter_mut().for_each(|t| *t -= spec.age_s);
     let interval_s = spec.interval_s.unwrap_or(INTERVAL_S);
+    let mut step_c = board.map_or(spec.step_c, Board::charge_step_c);
+    if step_c <= 0.0
+        && work.purpose == Purpose::Compare
+        && let Some(found_c) = shown_step_c(drive, &readings, sensor.held_reference)
+    {
+        step_c = found_c;
+        work.remark(format!(
+            "{column} counts in steps of {} C, which the model file does not state: taken as its step_c in [charge]",
+            at_most(step_c, 4)
+        ));
+    }
     let largest = drive
         .reference
         .iter()
@@ -198,6 +222,76 @@ fn differences(
     }
     observed.t_s = times_s.into();
     (drive, observed, kept, resets)
+}
+
+/// The step in which a counter counts, if its readings show one.
+///
+/// A current of a few even levels moves a counter without steps by few even amounts too. Only one with steps keeps a remainder,
+/// and strays by it from the charge of the reference.
+fn shown_step_c(drive: &Drive, readings: &Observed, held: bool) -> Option<f64> {
+    let passed = integral(&drive.t_s, &drive.segments, &drive.reference, held);
+    // Counted and passed from one reading to the next; from its own zero in each stretch.
+    let mut moves: Vec<f64> = Vec::new();
+    let mut courses: Vec<Vec<(f64, f64)>> = Vec::new();
+    let mut largest = 0.0_f64;
+    for (segment, rows) in readings.stretches.iter() {
+        let own = drive.segments.get(segment).cloned();
+        let Some(own) = own.filter(|own| !own.is_empty()) else {
+            continue;
+        };
+        let mut cursor = Cursor::new(&drive.t_s, own);
+        let course: Vec<(f64, f64)> = rows
+            .filter(|row| readings.valid[*row])
+            .map(|row| {
+                let there = cursor.integral(&passed, &drive.reference, readings.t_s[row], held);
+                (readings.value[row], there)
+            })
+            .collect();
+        moves.extend(course.windows(2).map(|pair| (pair[1].0 - pair[0].0).abs()));
+        largest = course
+            .iter()
+            .fold(largest, |most, one| most.max(one.0.abs()));
+        courses.push(course);
+    }
+    let count = moves.len();
+    moves.sort_unstable_by(f64::total_cmp);
+    // Digits that a difference of large numbers loses make no other level.
+    moves.dedup_by(|next, kept| *next - *kept < SAME * largest);
+    if moves.len() * REPEATED > count {
+        return None;
+    }
+    let step_c = grid(&moves)?;
+    // Over a step or more of charge: what was counted, and what passed.
+    let mut pairs: Vec<(f64, f64)> = Vec::new();
+    for course in courses {
+        let mut rows = course.into_iter();
+        let Some(mut last) = rows.next() else {
+            continue;
+        };
+        for now in rows {
+            if (now.1 - last.1).abs() >= step_c {
+                pairs.push((now.0 - last.0, now.1 - last.1));
+                last = now;
+            }
+        }
+    }
+    if pairs.len() < FEWEST_ROWS {
+        return None;
+    }
+    let moved: f64 = pairs.iter().map(|(_, passed)| passed.abs()).sum();
+    let (cross, square) = pairs
+        .iter()
+        .fold((0.0, 0.0), |(cross, square), (counted, passed)| {
+            (cross + counted * passed, square + passed * passed)
+        });
+    let mut strayed: Vec<f64> = pairs
+        .iter()
+        .map(|(counted, passed)| (counted - cross / square * passed).abs())
+        .collect();
+    let middle = strayed.len() / 2;
+    let strayed = *strayed.select_nth_unstable_by(middle, f64::total_cmp).1;
+    // The last digit of a file is no step that matters.
+    (strayed > KEPT * step_c && step_c > FINE * moved / pairs.len() as f64).then_some(step_c)
 }
 
 /// How fast the mean current of each reading changes if both of its ends are taken earlier, from `later_s` on: in A/s.
