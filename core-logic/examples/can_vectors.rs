@@ -254,8 +254,9 @@ fn state_of_charge(random: &mut Random, counter: u8) -> (Frame, Signals) {
     };
     let raw = rounded(i64::from(value.state_of_charge.get()), 100);
     let (percent, causes) = measured(raw, (0, 10_000), 16_383, 100.0, value.validity, true);
+    // A bound is rounded up.
     let uncertainty = value.uncertainty.map_or(1_023, |ppm| {
-        rounded(i64::from(ppm.get()), 1_000).clamp(0, 1_000)
+        ((i64::from(ppm.get()) + 999) / 1_000).clamp(0, 1_000)
     });
     let remaining = value.remaining.map_or(65_535, |charge| {
         rounded(charge.get(), 360_000_000_000).clamp(0, 65_534)

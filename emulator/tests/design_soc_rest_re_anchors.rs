@@ -169,13 +169,20 @@ fn rest_after_a_drive_re_anchors_the_state_of_charge_which_survives_a_reset() {
     // The rest: not before its time, then at once.
     bench.run(REST_S - 5.0);
     assert_eq!(bench.input("anchorings"), 0, "too early");
-    // The receiver of a single request is busy for longer than a millisecond: look at CAN.
+    // The receiver of a single request is busy for longer than a millisecond: look at CAN. The remaining charge is the
+    // estimate's, which moves at once.
+    let counted_ah = bench.signal("StateOfCharge", "RemainingCharge");
     bench.until("the anchoring", 10.0, |rig| {
         rig.view
-            .signal("StateOfCharge", "StateOfChargeUncertainty")
-            .is_some_and(|now| now < 0.5 * within)
+            .signal("StateOfCharge", "RemainingCharge")
+            .is_some_and(|now| (now - counted_ah).abs() > 0.005 * capacity_ah)
     });
     let rested_s = bench.now_s() - start_s - drive_s;
+    let (followed, way) = soc(&bench);
+    assert!(
+        (followed - soc_after_drive * 100.0).abs() <= way,
+        "{followed} ± {way} % on the way to the estimate"
+    );
     // The presented value follows by 1 % a second.
     bench.run(5.0);
     assert_eq!(bench.input("anchorings"), 1);
