@@ -428,6 +428,24 @@ fn steps_that_noise_softens() {
 }
 
 /// The same loop of a core without a gap, by relays of this test's own: what is kept is the sign of what was large enough.
+/// Noise ahead of a grid of three times its size takes every other reading over an edge: rounding the simulation makes the error no
+/// smaller, and the readings lie on the grid all the same.
+#[test]
+fn steps_that_noise_goes_over_are_told_by_the_readings() {
+    const STEP_A: f64 = 1.5;
+    let truth = truth();
+    let mut noise = noise(61, NOISE_A);
+    let read = truth.current_a.iter().map(|i| i + noise());
+    let read: Vec<f64> = read.map(|y| STEP_A * (y / STEP_A).round()).collect();
+    let report = explained_as_read(&truth, read, Coloured::default(), 61, &[]);
+    let [effect] = report.effects.as_slice() else {
+        panic!("{:?} {:?}", report.effects, report.decisions);
+    };
+    assert_eq!(effect.id, "quantisation", "{:?}", report.decisions);
+    let found = effect.parameters[0].value;
+    assert!((found - STEP_A).abs() < 0.001 * STEP_A, "{found}");
+}
+
 #[test]
 fn a_closed_core_is_hysteresis() {
     let truth = truth();

@@ -60,6 +60,10 @@ const CHANCE: f64 = 1e-3;
 /// An effect would do as well as another if it takes at least this share of what that one takes.
 const EQUAL: f64 = 0.5;
 
+/// A simulation that is rounded may be off by this many times the variance of rounding more than one that is not: by once where noise
+/// is as loud as a step, and chance.
+const DITHERED: f64 = 1.1;
+
 /// Rounds of adding, doing without and exchanging.
 const ROUNDS: usize = 3;
 
@@ -289,9 +293,12 @@ fn marked(
         });
         // The other values are those of the smooth simulation: steps have no slope to fit by.
         let stepped = Fit::of(bench, model.clone(), smooth.cost);
-        if loss(&stepped.residual, now.sigma) >= loss(&now.residual, now.sigma) {
+        // Where noise goes to and fro over the edges, rounding the simulation adds at most a second rounding error.
+        let there = bench.as_read(&stepped.residual);
+        let most = energy + DITHERED * mark.variance;
+        if dot(&there, &there) / there.len().max(1) as f64 > most {
             decisions.push(format!(
-                "{} not added, though the readings lie on a grid: with its steps the error is no smaller.",
+                "{} not added, though the readings lie on a grid: its steps make the error larger than noise ahead of them would.",
                 card.id
             ));
             continue;
