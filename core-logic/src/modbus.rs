@@ -223,15 +223,13 @@ impl CommandRule {
             true => Err(Exception::ServerDeviceFailure),
             false => Ok(()),
         };
-        let flash_free = || match readings.storage_busy {
+        let unless = |busy: bool| match busy {
             true => Err(Exception::ServerDeviceBusy),
             false => Ok(()),
         };
+        let flash_free = || unless(readings.storage_busy);
         // A restore would put another correction under what is being taken.
-        let settings_stay = || match readings.configuration_in_transfer {
-            true => Err(Exception::ServerDeviceBusy),
-            false => Ok(()),
-        };
+        let settings_stay = || unless(readings.configuration_in_transfer);
         match self {
             Self::Always => Ok(()),
             Self::Idle => {

@@ -23,8 +23,8 @@
 //! there before).
 //!
 //! **On the bus.** The estimate moves at once, the presented value follows it by at most
-//! [`SocConfig::presented_slew_ppm_per_s`]; what is between them is added to the half-width that goes out. Only the very first anchor is presented at once: until then the state of
-//! charge is marked as not known.
+//! [`SocConfig::presented_slew_ppm_per_s`]; what is between them is added to the half-width that goes out. Only the very
+//! first anchor is presented at once: until then the state of charge is marked as not known.
 
 use serde::{Deserialize, Serialize};
 

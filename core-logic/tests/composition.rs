@@ -50,6 +50,17 @@ struct Bench {
 }
 
 impl Bench {
+    /// The cell's voltage comes over CAN.
+    fn cell_at_4_v(&mut self) {
+        let voltage = BatteryVoltage {
+            cell: Some(Microvolts::from_millivolts(4_000)),
+            pack: None,
+            cell_temperature: None,
+        };
+        self.measurement
+            .on_battery_voltage(&voltage, Instant::from_ticks(self.now));
+    }
+
     fn new(configuration: Configuration) -> Self {
         let start = Instant::from_ticks(0);
         Self {
@@ -1127,14 +1138,7 @@ fn what_is_presented_is_within_its_uncertainty_of_the_estimate() {
     let share = |charge: Nanocoulombs| charge.get() as f64 / (f64::from(capacity) * 3.6e9) * 1e6;
     let mut farthest = 0.0_f64;
     for _ in 0..2_500 {
-        bench.measurement.on_battery_voltage(
-            &BatteryVoltage {
-                cell: Some(Microvolts::from_millivolts(4_000)),
-                pack: None,
-                cell_temperature: None,
-            },
-            Instant::from_ticks(bench.now),
-        );
+        bench.cell_at_4_v();
         bench.run_ms(1_000);
         let sent = bench.measurement.state_of_charge();
         let kept = bench.measurement.retained(0).soc;
@@ -1180,14 +1184,7 @@ fn no_anchor_while_the_current_is_known_to_be_wrong() {
             .set_state_of_charge(Ppm(500_000), Ppm(150_000));
         bench.report.mean_current = Microamps::from_amps(amps);
         for _ in 0..2_000 {
-            bench.measurement.on_battery_voltage(
-                &BatteryVoltage {
-                    cell: Some(Microvolts::from_millivolts(4_000)),
-                    pack: None,
-                    cell_temperature: None,
-                },
-                Instant::from_ticks(bench.now),
-            );
+            bench.cell_at_4_v();
             // The meter counts on, the converter stands at 0 A: its last bit moves.
             bench.code ^= 1;
             let counted = Nanocoulombs::from_coulombs(i64::from(amps));

@@ -89,8 +89,6 @@ pub struct Center {
     seconds: u32,
     shown: Option<Code>,
     meter_report_at: Option<Instant>,
-    /// Nothing was read of the meter for [`METER_STALE`].
-    meter_is_stale: bool,
     seen: Seen,
     last_codes: [u8; 8],
 }
@@ -138,7 +136,6 @@ impl Center {
             seconds: 0,
             shown: None,
             meter_report_at: None,
-            meter_is_stale: false,
             seen: Seen::default(),
             last_codes: [255; 8],
         }
@@ -207,7 +204,7 @@ impl Center {
             state_fresh: state.is_some(),
             voltage_fresh: self.receiver.battery_voltage(now).is_some(),
         };
-        let external = self.external(link);
+        let external = self.external(now, link);
         let tick = self
             .measurement
             .tick(&self.configuration, now, &vehicle, history, external);
@@ -258,12 +255,10 @@ impl Center {
 
     fn on_meter(&mut self, now: Instant, link: &MeterLink) {
         let report = &link.report;
-        let stale = report.at.is_none_or(|at| elapsed(at, now) > METER_STALE);
-        self.meter_is_stale = stale;
         let causes = Validity::VALID
             .and_if(link.in_self_test, Validity::CALIBRATING)
             .and_if(!link.health.counting, Validity::CHIP_FAULT)
-            .and_if(stale, Validity::STALE);
+            .and_if(is_stale(report, now), Validity::STALE);
         if report.at != self.meter_report_at || !causes.is_valid() {
             self.meter_report_at = report.at;
             self.measurement
@@ -272,7 +267,7 @@ impl Center {
     }
 
     /// The conditions that only the owners of the hardware know.
-    fn external(&mut self, link: &MeterLink) -> CodeSet {
+    fn external(&mut self, now: Instant, link: &MeterLink) -> CodeSet {
         let health = &link.health;
         let seen = &mut self.seen;
         if self.ticks.is_multiple_of(SECOND) {
@@ -285,7 +280,7 @@ impl Center {
             // During the self-test the chip answers; it just counts nothing that anybody may use.
             (
                 Code::MeterNoAnswer,
-                (!health.counting || self.meter_is_stale) && !link.in_self_test,
+                (!health.counting || is_stale(&link.report, now)) && !link.in_self_test,
             ),
             (Code::MeterDeadBus, health.dead_bus),
             (Code::MeterChecksum, seen.checksum_bad),
@@ -417,4 +412,9 @@ impl Center {
             self.bus.error_counters(),
         ];
     }
+}
+
+/// Whether nothing was read of the meter for [`METER_STALE`].
+fn is_stale(report: &MeterReport, now: Instant) -> bool {
+    report.at.is_none_or(|at| elapsed(at, now) > METER_STALE)
 }

@@ -236,7 +236,7 @@ fn one(
     tell(&straight, (decided, &shown), None, options, report)
 }
 
-/// Puts what was decided about a signal into the report; `between` as in [`times_found`].
+/// Puts what was decided about a signal into the report; `between`: as `course` in [`times_found`].
 fn tell(
     course: &Course<'_>,
     (decided, shown): (Decided, &Fit),

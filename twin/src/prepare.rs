@@ -455,8 +455,8 @@ impl<'a> Work<'a> {
             accuracy: Accuracy {
                 zero: sensor.accuracy.zero,
                 gain: sensor.accuracy.gain,
-                // The width, to either side.
                 scatter: 0.0,
+                // The width, to either side.
                 moment_s: 0.5 * slack_s,
             },
         };

@@ -2,7 +2,12 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+#[path = "common/command.rs"]
+mod command;
+
 use std::{fs, path::Path, process::Command};
+
+use command::{EXPLAIN, twin};
 
 const PAIR: &str = "schema = 1\n[sensor]\n";
 
@@ -26,11 +31,7 @@ fn refused(files: &[(&str, &str)], arguments: &[&str]) -> String {
         fs::write(folder.path().join(name), content).unwrap();
     }
     let before = names(folder.path());
-    let output = Command::new(env!("CARGO_BIN_EXE_twin"))
-        .args(arguments)
-        .current_dir(folder.path())
-        .output()
-        .unwrap();
+    let output = twin(folder.path(), arguments);
     let sentence = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(2), "{sentence}");
     assert!(output.stdout.is_empty());
@@ -50,18 +51,7 @@ fn names(folder: &Path) -> Vec<String> {
 }
 
 fn explained(model: &str, recording: &str) -> String {
-    refused(
-        &[("m.toml", model), ("r.csv", recording)],
-        &[
-            "explain",
-            "--model",
-            "m.toml",
-            "--recording",
-            "r.csv",
-            "--out",
-            "out",
-        ],
-    )
+    refused(&[("m.toml", model), ("r.csv", recording)], &EXPLAIN)
 }
 
 fn says(sentence: &str, parts: &[&str]) {

@@ -2,11 +2,12 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
-use std::{
-    fs,
-    path::Path,
-    process::{Command, Output},
-};
+#[path = "common/command.rs"]
+mod command;
+
+use std::{fs, process::Command};
+
+use command::twin;
 
 const DATABASE: &str = r#"VERSION ""
 
@@ -21,14 +22,6 @@ const LOG: &str = "(1700000000.5) can0 010#E8030C0E\n\
     (1700000000.6) can0 7FF#00\n\
     (1700000000.75) can0 010#18FC\n\
     (1700000001.5) can0 010#R\n";
-
-fn twin(folder: &Path, arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_twin"))
-        .args(arguments)
-        .current_dir(folder)
-        .output()
-        .unwrap()
-}
 
 fn text(bytes: &[u8]) -> String {
     String::from_utf8(bytes.to_vec()).unwrap()

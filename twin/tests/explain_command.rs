@@ -2,12 +2,12 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
-use std::{
-    fs,
-    path::Path,
-    process::{Command, Output},
-};
+#[path = "common/command.rs"]
+mod command;
 
+use std::{fs, path::Path, process::Output};
+
+use command::{EXPLAIN, twin};
 use rand_chacha::{
     ChaCha8Rng,
     rand_core::{Rng, SeedableRng},
@@ -17,27 +17,9 @@ use twin::model::Model;
 const BOARD: &str =
     "# My car.\nschema = 1\n\n[sensor]\nfront_end = \"hah1bv\"\nnoise = 0.05 # as measured\n";
 
-fn twin(folder: &Path, arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_twin"))
-        .args(arguments)
-        .current_dir(folder)
-        .output()
-        .unwrap()
-}
-
 /// `r.csv` under `m.toml`, into `out`.
 fn explained(folder: &Path, more: &[&str]) -> Output {
-    let mut arguments = vec![
-        "explain",
-        "--model",
-        "m.toml",
-        "--recording",
-        "r.csv",
-        "--out",
-        "out",
-    ];
-    arguments.extend_from_slice(more);
-    twin(folder, &arguments)
+    twin(folder, &[&EXPLAIN, more].concat())
 }
 
 /// A drive, and what the simulated board reads with a gain and an offset that the model lacks, and with noise.

@@ -46,9 +46,7 @@ impl Effect for Quantisation {
     }
 
     fn mark(&self, scale: &Scale, clues: &Clues<'_>) -> Option<Mark> {
-        let step = lattice(clues.observed)
-            .into_iter()
-            .find(|step| *step > 1.5 * scale.quantum)?;
+        let step = lattice(clues.observed).filter(|step| *step > 1.5 * scale.quantum)?;
         let known = clues.observed.iter().filter(|y| y.is_finite());
         let (low, high) = known.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), y| {
             (low.min(*y), high.max(*y))
@@ -73,7 +71,7 @@ impl Effect for Quantisation {
     /// Behind a staircase noise takes readings off its levels.
     fn noise_ahead(&self, values: &[f64], clues: &Clues<'_>) -> bool {
         let known = || clues.observed.iter().copied().filter(|y| y.is_finite());
-        !lattice(clues.observed).is_empty() || concentration(known(), values[0]) > ON_GRID
+        lattice(clues.observed).is_some() || concentration(known(), values[0]) > ON_GRID
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
@@ -98,8 +96,8 @@ const OFF: f64 = 0.2;
 /// Sums that are kept side by side.
 const LANES: usize = 8;
 
-/// Steps of a grid on which nearly all readings lie; usually one or none.
-pub(crate) fn lattice(observed: &[f64]) -> Vec<f64> {
+/// Step of a grid on which nearly all readings lie, in any order; `None` if there is none.
+pub(crate) fn lattice(observed: &[f64]) -> Option<f64> {
     let mut sorted: Vec<f64> = observed
         .iter()
         .copied()
@@ -109,9 +107,9 @@ pub(crate) fn lattice(observed: &[f64]) -> Vec<f64> {
     sorted.dedup();
     // A grid repeats values.
     if sorted.len() < 4 || sorted.len() * 3 > observed.len() {
-        return Vec::new();
+        return None;
     }
-    grid(&sorted).into_iter().collect()
+    grid(&sorted)
 }
 
 /// The step of a grid on which nearly all of some values lie, which ascend: two on it differ by its step or a multiple.
@@ -215,7 +213,7 @@ mod tests {
                 .collect();
             let found = lattice(&readings);
             assert!(
-                found.len() == 1 && (found[0] / step - 1.0).abs() < 1e-4,
+                found.is_some_and(|found| (found / step - 1.0).abs() < 1e-4),
                 "{found:?} for {step}"
             );
         }

@@ -44,6 +44,11 @@ const WORTH: f64 = 0.1;
 /// uncertainty but physics that was left out, and has a name.
 pub(super) const BASE_OFF: f64 = 4.0;
 
+/// Whether a value of the base stands at that end, by how many of its standard uncertainties it is off.
+pub(super) fn at_base_end(deviations: f64) -> bool {
+    deviations.abs() >= BASE_OFF * (1.0 - 1e-9)
+}
+
 /// A fit of more rows than this does not keep its slope: memory stays linear in the recording, with a small factor.
 const KEPT_ROWS: usize = 40_000;
 
@@ -268,7 +273,7 @@ fn base_sigmas(bench: &Workbench<'_>) -> Option<(f64, f64)> {
 /// Whether a value of the base stands where its uncertainty ends, and the residual would have it beyond: it is free no more, and
 /// hides nothing that an effect explains.
 fn ended(column: &[f64], prior: f64, at: f64, residual: &[f64]) -> bool {
-    if prior <= 0.0 || at.abs() * prior.sqrt() < BASE_OFF * (1.0 - 1e-9) {
+    if prior <= 0.0 || !at_base_end(at * prior.sqrt()) {
         return false;
     }
     let sigma = spread(residual);

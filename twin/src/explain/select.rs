@@ -273,8 +273,7 @@ fn marked(
         if members.any(|member| member.id() == card.id && bench.shown(member).is_some()) {
             continue;
         }
-        let as_read = bench.as_read(&now.predicted);
-        let Some(mark) = effect.mark(&bench.scale, &bench.clues(&as_read)) else {
+        let Some(mark) = bench.mark(effect) else {
             continue;
         };
         let mut base = now.model.clone();
@@ -289,10 +288,11 @@ fn marked(
         let smooth = missed(bench, fit(bench, &base, None));
         let model = smooth.model.with(Member {
             effect,
-            values: mark.values,
+            values: mark.values.clone(),
         });
         // The other values are those of the smooth simulation: steps have no slope to fit by.
-        let stepped = Fit::of(bench, model.clone(), smooth.cost);
+        let stepped = Fit::of(bench, model, smooth.cost);
+        let members = &stepped.model.members;
         // Where noise goes to and fro over the edges, rounding the simulation adds at most a second rounding error.
         let there = bench.as_read(&stepped.residual);
         let most = energy + DITHERED * mark.variance;
@@ -312,7 +312,7 @@ fn marked(
             .iter()
             .filter_map(|one| {
                 let id = now.model.members[one.index].id();
-                let index = model.members.iter().position(|member| member.id() == id)?;
+                let index = members.iter().position(|member| member.id() == id)?;
                 (id != card.id).then(|| Named {
                     index,
                     ..one.clone()
@@ -321,7 +321,7 @@ fn marked(
             .collect();
         named = kept;
         named.push(Named {
-            index: model.members.len() - 1,
+            index: members.len() - 1,
             held_out_gain: gain,
             placebo_p99: 0.0,
             equivalent: Vec::new(),

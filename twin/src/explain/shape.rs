@@ -154,7 +154,6 @@ fn misfit(
         })
         .collect();
     let effect = |index: usize| fit.model.members[index].effect;
-    let clues = bench.clues(&fit.predicted);
     // The others' equations are idealisations, too.
     let allowed = |index: usize| {
         let beside: f64 = (0..taken.len())
@@ -167,7 +166,7 @@ fn misfit(
         .map(|index| (index, taken[index].0))
         .filter(|(index, size)| *size >= CURVE * taken[*index].1)
         // Steps that the readings show by themselves; noise makes a softer curve of them.
-        .filter(|(index, _)| effect(*index).mark(&bench.scale, &clues).is_none())
+        .filter(|(index, _)| bench.mark(effect(*index)).is_none())
         .filter(|(index, _)| left > allowed(*index).max(accuracy))
         .min_by(|a, b| a.1.total_cmp(&b.1))?;
     Some((

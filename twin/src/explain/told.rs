@@ -1,6 +1,6 @@
 //! What the report says of one signal: its effects, its places, its plots and its sentence.
 
-use super::fit::{BASE_OFF, Fit};
+use super::fit::{BASE_OFF, Fit, at_base_end};
 use super::flexible::Explainable;
 use super::select::{Selection, percent};
 use super::workbench::{Member, Workbench};
@@ -279,8 +279,7 @@ fn at_limit(nuisance: Nuisance, base: &Base) -> bool {
     let Base::Battery(base) = base else {
         return false;
     };
-    let ends =
-        |found: f64, sigma: f64| sigma > 0.0 && found.abs() >= BASE_OFF * sigma * (1.0 - 1e-9);
+    let ends = |found: f64, sigma: f64| sigma > 0.0 && at_base_end(found / sigma);
     ends(nuisance.soc_shift, base.initial_soc_sigma)
         || ends(nuisance.resistance, base.resistance_sigma)
 }

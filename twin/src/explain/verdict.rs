@@ -234,7 +234,7 @@ pub(super) fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
             .model
             .members
             .iter()
-            .filter_map(|member| member.effect.mark(&bench.scale, &clues))
+            .filter_map(|member| bench.mark(member.effect))
             .map(|mark| mark.variance)
             .sum();
         2.0 * grid * count

@@ -116,8 +116,8 @@ pub struct Workbench<'a> {
     pub modelled: f64,
     /// Fits that were made: from which model to which, with spread and loss.
     known: Mutex<HashMap<Key, (Model, f64, f64)>>,
-    /// What the readings show by themselves, by effect.
-    shown: Vec<(&'static str, Mark)>,
+    /// What the readings show by themselves, by effect: found once, for no simulation changes it.
+    marks: Vec<(&'static str, Mark)>,
     /// Makes the stated noise white, with the readings after it.
     white: Option<(Whitening, Vec<f64>)>,
 }
@@ -205,7 +205,7 @@ impl<'a> Workbench<'a> {
             observed: &y,
             predicted: &plain,
         };
-        let shown = library
+        let marks = library
             .iter()
             .filter_map(|effect| Some((effect.card().id, effect.mark(&scale, &clues)?)))
             .collect();
@@ -213,7 +213,7 @@ impl<'a> Workbench<'a> {
             problem,
             chain,
             scale,
-            shown,
+            marks,
             modelled,
             rows,
             t_s,
@@ -245,17 +245,22 @@ impl<'a> Workbench<'a> {
             blocks: self.blocks.clone(),
             library: self.library.clone(),
             modelled: self.modelled,
-            shown: self.shown.clone(),
+            marks: self.marks.clone(),
             known: Mutex::default(),
             white: Some((whitening, y)),
         })
     }
 
+    /// What the readings show of an effect by themselves.
+    pub fn mark(&self, effect: &dyn Effect) -> Option<&Mark> {
+        let of_effect = |(id, _): &&(&str, Mark)| *id == effect.card().id;
+        self.marks.iter().find(of_effect).map(|(_, mark)| mark)
+    }
+
     /// How far the values of an effect may be off, if they are those that the readings show by themselves: no fit moves them.
     pub fn shown(&self, member: &Member) -> Option<&[f64]> {
-        let shown = self.shown.iter().find(|(id, _)| *id == member.id());
-        let mark = shown.map(|(_, mark)| mark);
-        mark.filter(|mark| mark.values == member.values)
+        self.mark(member.effect)
+            .filter(|mark| mark.values == member.values)
             .map(|mark| mark.within.as_slice())
     }
 
@@ -616,18 +621,13 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
     } else {
         *steps.select_nth_unstable_by(middle, f64::total_cmp).1
     };
-    let span_s = drive
-        .segments
-        .iter()
-        .filter(|rows| !rows.is_empty())
-        .map(|rows| drive.t_s[rows.end - 1] - drive.t_s[rows.start])
-        .fold(0.0, f64::max);
-    let operation_s = drive
-        .operations()
-        .into_iter()
-        .filter(|rows| !rows.is_empty())
-        .map(|rows| drive.t_s[rows.end - 1] - drive.t_s[rows.start])
-        .fold(0.0, f64::max);
+    let longest_s = |stretches: &[Range<usize>]| {
+        stretches
+            .iter()
+            .filter(|rows| !rows.is_empty())
+            .map(|rows| drive.t_s[rows.end - 1] - drive.t_s[rows.start])
+            .fold(0.0, f64::max)
+    };
     let mut scale = Scale {
         largest,
         both_ways: both_ways(drive, largest),
@@ -644,8 +644,8 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         },
         fastest_s: 0.02 * step_s.min(reading_step_s),
         begin_s: problem.observed.t_s.first().copied().unwrap_or_default(),
-        span_s,
-        operation_s,
+        span_s: longest_s(&drive.segments),
+        operation_s: longest_s(&drive.operations()),
         ..Scale::default()
     };
     if problem.view == View::Charge {

@@ -141,8 +141,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
                 accuracy: Accuracy {
                     zero: accuracy.zero,
                     gain: accuracy.gain,
-                    scatter: 0.0,
-                    moment_s: 0.0,
+                    ..Accuracy::default()
                 },
             },
             rows,
@@ -157,7 +156,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
 fn grid(work: &mut Work<'_>, name: &str, observed: &Observed) -> f64 {
     let read = observed.value.iter().zip(&observed.valid);
     let read: Vec<f64> = read.filter(|(_, valid)| **valid).map(|(y, _)| *y).collect();
-    let Some(step) = lattice(&read).first().copied() else {
+    let Some(step) = lattice(&read) else {
         return 0.0;
     };
     let unit = recording::name::unit(name).unwrap_or("1");

@@ -1,0 +1,27 @@
+//! `twin` as it is called.
+
+use std::{
+    path::Path,
+    process::{Command, Output},
+};
+
+/// `twin explain` of `r.csv` under `m.toml`, into `out`.
+#[allow(dead_code, reason = "not every test explains")]
+pub const EXPLAIN: [&str; 7] = [
+    "explain",
+    "--model",
+    "m.toml",
+    "--recording",
+    "r.csv",
+    "--out",
+    "out",
+];
+
+/// Runs `twin` in a folder.
+pub fn twin(folder: &Path, arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_twin"))
+        .args(arguments)
+        .current_dir(folder)
+        .output()
+        .unwrap()
+}
