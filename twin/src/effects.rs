@@ -391,6 +391,10 @@ pub struct Mark {
     pub within: Vec<f64>,
     /// Variance that it adds to the residual, in the view's unit squared.
     pub variance: f64,
+    /// The part of it that is rounding: a simulation that rounds too has as much again where noise is ahead of the grid.
+    pub rounding: f64,
+    /// What the readings do.
+    pub what: &'static str,
 }
 
 /// What is known when starts are looked for: the readings that count, with the simulation so far.

@@ -1,7 +1,7 @@
 //! End of the output.
 
 use super::scene::{Scale, Scene};
-use super::{BENT, Card, Clues, Effect, Parameter, Search, Stage};
+use super::{BENT, Card, Clues, Effect, Mark, Parameter, Search, Stage};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -53,6 +53,33 @@ impl Effect for Clipping {
         starts
     }
 
+    fn mark(&self, _scale: &Scale, clues: &Clues<'_>) -> Option<Mark> {
+        let side = |sign: f64| {
+            rail(
+                clues.observed.iter().map(|y| sign * y),
+                clues.predicted.iter().map(|p| sign * p),
+            )
+        };
+        let rails = [side(1.0), side(-1.0)];
+        let known: Vec<&Rail> = rails.iter().flatten().collect();
+        if known.is_empty() {
+            return None;
+        }
+        let [high, low] = &rails;
+        Some(Mark {
+            values: vec![
+                high.as_ref().map_or(f64::INFINITY, |rail| rail.at),
+                low.as_ref().map_or(f64::NEG_INFINITY, |rail| -rail.at),
+            ],
+            within: [high, low]
+                .map(|rail| rail.as_ref().map_or(0.0, |rail| rail.within))
+                .to_vec(),
+            variance: known.iter().map(|rail| rail.variance).sum(),
+            rounding: 0.0,
+            what: "stay at an end",
+        })
+    }
+
     fn kinked(&self, _parameter: usize) -> bool {
         true
     }
@@ -79,5 +106,101 @@ impl Effect for Clipping {
             .signal
             .iter_mut()
             .for_each(|value| *value = value.min(high).max(low));
+    }
+}
+
+/// Readings that stay at an end, at least.
+const STAY: usize = 5;
+/// Of the readings that should be larger than the middle one of them, this share is there as well.
+const NEARLY_ALL: f64 = 0.9;
+/// What is cut off of the middle one of them, in spreads of the mismatch.
+const CUT_OFF: f64 = 3.0;
+
+/// An upper end at which readings stay while the simulation goes on.
+struct Rail {
+    at: f64,
+    /// Half of the least by which two readings differ.
+    within: f64,
+    /// Mean square of what it takes from the simulation.
+    variance: f64,
+}
+
+/// The upper rail that readings show by themselves: they stay at their highest value, nearly all of those that should be larger are
+/// there, and what is cut off is much beside what is not. One that hangs at its highest value is no rail: it stays there below as well.
+fn rail(observed: impl Iterator<Item = f64>, predicted: impl Iterator<Item = f64>) -> Option<Rail> {
+    let rows: Vec<(f64, f64)> = observed
+        .zip(predicted)
+        .filter(|(y, p)| y.is_finite() && p.is_finite())
+        .collect();
+    let middle = |mut values: Vec<f64>| -> Option<f64> {
+        let at = values.len() / 2;
+        (!values.is_empty()).then(|| *values.select_nth_unstable_by(at, f64::total_cmp).1)
+    };
+    let at = rows.iter().map(|(y, _)| *y).reduce(f64::max)?;
+    let there = || rows.iter().filter(|(y, _)| *y == at);
+    let spread = 1.4826 * middle(rows.iter().map(|(y, p)| (y - p).abs()).collect())?;
+    let expected = middle(there().map(|(_, p)| *p).collect())?;
+    let larger = rows.iter().filter(|(_, p)| *p > expected);
+    let (larger, stay) = larger.fold((0.0, 0.0), |(all, stay), (y, _)| {
+        (all + 1.0, stay + f64::from(u8::from(*y == at)))
+    });
+    let hang = there().filter(|(_, p)| *p < at - CUT_OFF * spread).count();
+    let count = there().count();
+    if count < STAY
+        || larger == 0.0
+        || stay < NEARLY_ALL * larger
+        || expected - at <= CUT_OFF * spread
+        || hang as f64 > (1.0 - NEARLY_ALL) * count as f64
+    {
+        return None;
+    }
+    let taken: f64 = rows.iter().map(|(_, p)| (p - at).max(0.0).powi(2)).sum();
+    let mut values: Vec<f64> = rows.iter().map(|(y, _)| *y).collect();
+    values.sort_unstable_by(f64::total_cmp);
+    let steps = values.windows(2).map(|pair| pair[1] - pair[0]);
+    let least = steps.filter(|step| *step > 0.0).reduce(f64::min)?;
+    Some(Rail {
+        at,
+        within: 0.5 * least,
+        variance: taken / rows.len() as f64,
+    })
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    /// A wave of ±100 in 400 rows, with an error that is not much.
+    fn rows() -> impl Iterator<Item = (f64, f64)> {
+        (0..400).map(|row| {
+            let p = 100.0 * (0.05 * f64::from(row)).sin();
+            (p + 0.3 * (7.1 * f64::from(row)).sin(), p)
+        })
+    }
+
+    fn seen(read: impl Fn(f64) -> f64) -> Option<Rail> {
+        let (y, p): (Vec<f64>, Vec<f64>) = rows().map(|(y, p)| (read(y), p)).unzip();
+        rail(y.into_iter(), p.into_iter())
+    }
+
+    #[test]
+    fn readings_that_stay_at_an_end_show_it() {
+        let rail = seen(|y| y.min(90.0)).unwrap();
+        assert_eq!(rail.at, 90.0);
+        assert!(rail.variance > 1.0 && rail.variance < 100.0);
+        let (y, p): (Vec<f64>, Vec<f64>) = rows().map(|(y, p)| (-y.max(-80.0), -p)).unzip();
+        assert_eq!(super::rail(y.into_iter(), p.into_iter()).unwrap().at, 80.0);
+    }
+
+    #[test]
+    fn a_highest_reading_alone_is_no_rail() {
+        assert!(seen(|y| y).is_none());
+        // Steps repeat the highest one.
+        assert!(seen(|y| (y / 2.0).round() * 2.0).is_none());
+        // One that hangs there, whatever the current does.
+        assert!(seen(|_| 90.0).is_none());
+        let hanging = |y: f64| if y < 0.0 { 90.0 } else { y.min(90.0) };
+        assert!(seen(hanging).is_none());
     }
 }

@@ -2,6 +2,7 @@
 
 use std::cmp::Ordering;
 use std::collections::HashSet;
+use std::ops::Range;
 use std::sync::{Arc, OnceLock};
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
@@ -48,6 +49,11 @@ pub(super) const BASE_OFF: f64 = 4.0;
 pub(super) fn at_base_end(deviations: f64) -> bool {
     deviations.abs() >= BASE_OFF * (1.0 - 1e-9)
 }
+
+/// A block that has this share of all that is known of a value is left out in parts.
+const ALONE: f64 = 0.9;
+/// So many.
+const PARTS: usize = 4;
 
 /// A fit of more rows than this does not keep its slope: memory stays linear in the recording, with a small factor.
 const KEPT_ROWS: usize = 40_000;
@@ -315,8 +321,14 @@ fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta
 fn coordinates(bench: &Workbench<'_>, model: &Model) -> Vec<(Coordinate, f64, f64, f64)> {
     let mut all = Vec::new();
     for (m, member) in model.members.iter().enumerate() {
+        if bench.shown(member).is_some() {
+            continue;
+        }
         for (p, parameter) in member.effect.card().parameters.iter().enumerate() {
             let value = member.values[p];
+            if !value.is_finite() {
+                continue;
+            }
             let (low, high) = member.effect.bounds(p, &bench.scale);
             let (logarithmic, step) = match parameter.search {
                 Search::Stepped => continue,
@@ -508,7 +520,7 @@ pub fn normal(
     columns: &[Vec<f64>],
     weights: &[f64],
     residual: &[f64],
-    rows: std::ops::Range<usize>,
+    rows: Range<usize>,
 ) -> (DMatrix<f64>, DVector<f64>) {
     let size = columns.len();
     let mut matrix = DMatrix::zeros(size, size);
@@ -580,6 +592,64 @@ impl Solver {
         for (value, scale) in right.iter_mut().zip(&self.scale) {
             *value /= scale;
         }
+    }
+
+    /// The most that a part of the matrix has of all that is known of some combination of values, 0 … 1.
+    fn most_of(&self, part: &DMatrix<f64>) -> f64 {
+        let Some(factor) = &self.factor else {
+            return 0.0;
+        };
+        let scaled = DMatrix::from_fn(part.nrows(), part.ncols(), |a, b| {
+            part[(a, b)] / (self.scale[a] * self.scale[b])
+        });
+        let half = factor.l_dirty().solve_lower_triangular(&scaled);
+        let whole =
+            half.and_then(|half| factor.l_dirty().solve_lower_triangular(&half.transpose()));
+        let Some(whole) = whole else {
+            return 0.0;
+        };
+        // None of them is negative: their sum is no less than the largest.
+        if whole.trace() < ALONE {
+            return whole.trace();
+        }
+        whole
+            .symmetric_eigenvalues()
+            .iter()
+            .copied()
+            .fold(0.0, f64::max)
+    }
+
+    /// Rows in parts of which each tells as much of the values as any other.
+    fn parts(
+        &self,
+        columns: &[Vec<f64>],
+        weights: &[f64],
+        rows: Range<usize>,
+    ) -> Vec<Range<usize>> {
+        let mut sum = 0.0;
+        let sums: Vec<f64> = rows
+            .clone()
+            .map(|row| {
+                let here = DVector::from_iterator(columns.len(), columns.iter().map(|c| c[row]));
+                let mut solved = here.clone();
+                self.solve(&mut solved);
+                sum += weights[row] * here.dot(&solved);
+                sum
+            })
+            .collect();
+        let mut from = rows.start;
+        (1..=PARTS)
+            .map(|part| {
+                let share = sum * part as f64 / PARTS as f64;
+                let to = match part {
+                    PARTS => rows.end,
+                    _ => rows.start + sums.partition_point(|sum| *sum < share),
+                };
+                let part = from..to.max(from);
+                from = part.end;
+                part
+            })
+            .collect()
     }
 }
 
@@ -958,6 +1028,8 @@ pub struct Blocked {
     pub matrices: Vec<DMatrix<f64>>,
     /// Right side of each block.
     pub rights: Vec<DVector<f64>>,
+    /// Huber's weights of the rows.
+    weights: Vec<f64>,
 }
 
 /// Huber's weights of residuals, in units of 1/sigma².
@@ -981,11 +1053,13 @@ pub fn blocked(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Blocked {
         slope,
         matrices,
         rights,
+        weights,
     }
 }
 
 /// Loss of each row of each block under a model whose values come from the other blocks only (one Gauss–Newton step from the whole fit,
-/// exact where the simulation is linear in its values), in units of sigma².
+/// exact where the simulation is linear in its values), in units of sigma². A block that alone tells some of the values is left out
+/// in parts: the others would say nothing of it, or anything.
 pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<Vec<f64>> {
     let blocked = blocked(bench, fit, sigma);
     let size = blocked.slope.len();
@@ -996,32 +1070,33 @@ pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<Vec<f64>> {
         total += matrix;
         right += part;
     }
+    let weights = &blocked.weights;
+    // Loss of rows with the values that are left without them.
+    let without = |rows: Range<usize>, matrix: &DMatrix<f64>, part: &DVector<f64>| -> Vec<f64> {
+        let step = solve(&(&total - matrix), &(&right - part), 1e-9);
+        rows.map(|row| {
+            let columns = blocked.slope.columns.iter().zip(step.iter());
+            let moved: f64 = columns.map(|(column, step)| column[row] * step).sum();
+            huber((fit.residual[row] - moved) / sigma)
+        })
+        .collect()
+    };
+    let solver = Solver::new(&total, 1e-9);
     bench
         .blocks
         .iter()
-        .enumerate()
-        .map(|(block, rows)| {
-            let step = if size == 0 {
-                DVector::zeros(0)
-            } else {
-                solve(
-                    &(&total - &blocked.matrices[block]),
-                    &(&right - &blocked.rights[block]),
-                    1e-9,
-                )
-            };
-            rows.clone()
-                .map(|row| {
-                    let moved: f64 = blocked
-                        .slope
-                        .columns
-                        .iter()
-                        .zip(step.iter())
-                        .map(|(column, step)| column[row] * step)
-                        .sum();
-                    huber((fit.residual[row] - moved) / sigma)
-                })
-                .collect()
+        .zip(blocked.matrices.iter().zip(&blocked.rights))
+        .map(|(rows, (matrix, part))| {
+            if solver.most_of(matrix) < ALONE {
+                return without(rows.clone(), matrix, part);
+            }
+            let columns = &blocked.slope.columns;
+            let parts = solver.parts(columns, weights, rows.clone());
+            let losses = parts.into_iter().flat_map(|rows| {
+                let (matrix, part) = normal(columns, weights, &fit.residual, rows.clone());
+                without(rows, &matrix, &part)
+            });
+            losses.collect()
         })
         .collect()
 }

@@ -64,6 +64,9 @@ const EQUAL: f64 = 0.5;
 /// is as loud as a step, and chance.
 const DITHERED: f64 = 1.1;
 
+/// An error that is larger by less than this factor is not.
+const NO_LARGER: f64 = 1.01;
+
 /// Rounds of adding, doing without and exchanging.
 const ROUNDS: usize = 3;
 
@@ -248,7 +251,8 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
             }
         }
     };
-    let (now, named) = marked(bench, now, named, &mut decisions);
+    let (mut now, named) = marked(bench, now, named, &mut decisions);
+    idle_off(bench, &mut now);
     Selection {
         plain,
         ids: now.model.ids(),
@@ -256,6 +260,24 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
         named,
         decisions,
         refused,
+    }
+}
+
+/// Switches off what does nothing (a rail that no reading reaches).
+fn idle_off(bench: &Workbench<'_>, now: &mut Fit) {
+    for m in 0..now.model.members.len() {
+        let parameters = now.model.members[m].effect.card().parameters;
+        for (p, parameter) in parameters.iter().enumerate() {
+            if !parameter.off.is_infinite() {
+                continue;
+            }
+            let mut model = now.model.clone();
+            model.members[m].values[p] = parameter.off;
+            // The same to the last digit: all that was found for the model stands.
+            if bench.run(&model) == now.predicted {
+                now.model = model;
+            }
+        }
     }
 }
 
@@ -295,19 +317,26 @@ fn marked(
         let members = &stepped.model.members;
         // Where noise goes to and fro over the edges, rounding the simulation adds at most a second rounding error.
         let there = bench.as_read(&stepped.residual);
-        let most = energy + DITHERED * mark.variance;
+        let most = NO_LARGER * energy + DITHERED * mark.rounding;
         if dot(&there, &there) / there.len().max(1) as f64 > most {
             decisions.push(format!(
-                "{} not added, though the readings lie on a grid: its steps make the error larger than noise ahead of them would.",
-                card.id
+                "{} not added, though the readings {}: it makes the error larger than noise ahead of it would.",
+                card.id, mark.what
             ));
             continue;
         }
         decisions.push(format!(
-            "{} added: the readings lie on a grid; its steps make {} of the residual's energy.",
+            "{} added: the readings {}; that makes {} of the residual's energy.",
             card.id,
+            mark.what,
             percent(gain)
         ));
+        let found = named
+            .iter()
+            .find(|one| now.model.members[one.index].id() == card.id);
+        // Found without its mark, it has what speaks for it.
+        let (held_out_gain, placebo_p99) =
+            found.map_or((gain, 0.0), |one| (one.held_out_gain, one.placebo_p99));
         let kept: Vec<Named> = named
             .iter()
             .filter_map(|one| {
@@ -322,8 +351,8 @@ fn marked(
         named = kept;
         named.push(Named {
             index: members.len() - 1,
-            held_out_gain: gain,
-            placebo_p99: 0.0,
+            held_out_gain,
+            placebo_p99,
             equivalent: Vec::new(),
         });
         now = stepped;

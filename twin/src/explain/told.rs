@@ -97,7 +97,7 @@ pub(super) fn effects(
                 .parameters
                 .iter()
                 .enumerate()
-                .filter(|(_, parameter)| !parameter.internal)
+                .filter(|(p, parameter)| !parameter.internal && member.values[*p].is_finite())
                 .map(|(p, parameter)| {
                     let value = member.values[p];
                     let [from, to] = intervals[named.index][p];

@@ -24,6 +24,8 @@ const COMMON: (f64, f64) = (0.8, 1.2816);
 const STRAY: f64 = 8.0;
 /// Up to this share of the readings they are rare.
 const RARE: f64 = 0.01;
+/// What would be so by chance less often than this is not chance.
+const BY_CHANCE: f64 = 0.05;
 /// Fewer readings beyond it are not told from a slip of the log.
 const STRAYS: usize = 2;
 /// Those readings are the mismatch if they make this share of its energy.
@@ -235,7 +237,7 @@ pub(super) fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
             .members
             .iter()
             .filter_map(|member| bench.mark(member.effect))
-            .map(|mark| mark.variance)
+            .map(|mark| mark.rounding)
             .sum();
         2.0 * grid * count
     }
@@ -247,6 +249,8 @@ struct Strays {
     /// The largest of them, in the view's unit, and its time in s.
     largest: f64,
     at_s: f64,
+    /// Whether all are at a change of range, and not by chance.
+    at_changes: bool,
     /// Whether they are the mismatch: most of it, or so many in a row that it is no slip of the log.
     decide: bool,
 }
@@ -291,8 +295,33 @@ fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
         count: rows.len(),
         largest: residual[largest].abs(),
         at_s: bench.t_s[largest],
+        at_changes: at_changes(bench, &rows),
         decide: (rows.len() >= least && energy > share * all) || (stated && in_a_row >= IN_A_ROW),
     })
+}
+
+/// Whether readings are all next to a change of the range flag, and would hardly be by chance.
+fn at_changes(bench: &Workbench<'_>, rows: &[usize]) -> bool {
+    let drive = &bench.problem.drive;
+    let Some(flag) = &drive.range_high else {
+        return false;
+    };
+    let high = |row: usize| flag[row] > 0.5;
+    let mut changes_s: Vec<f64> = (1..flag.len())
+        .filter(|&row| high(row) != high(row - 1))
+        .map(|row| drive.t_s[row])
+        .collect();
+    changes_s.sort_unstable_by(f64::total_cmp);
+    let next_to_s = 1.5 * bench.scale.step_s;
+    let is_next = |row: &usize| {
+        let from_s = bench.t_s[*row] - next_to_s;
+        let at = changes_s.partition_point(|change_s| *change_s < from_s);
+        changes_s
+            .get(at)
+            .is_some_and(|change_s| *change_s < from_s + 2.0 * next_to_s)
+    };
+    let share = changes_s.len() as f64 * 2.0 * next_to_s / bench.scale.span_s;
+    rows.iter().all(is_next) && share.powi(rows.len() as i32) < BY_CHANCE
 }
 
 /// What is to be said of readings that no noise makes and that nothing accounts for, where they decide nothing.
@@ -303,7 +332,11 @@ pub(super) fn slips(read: &Workbench<'_>, shown: &Fit, verdict: Verdict) -> Opti
         return None;
     }
     let strays = strays(read, &shown.residual)?;
-    let why = why_astray(strays.count as f64 / read.len() as f64, verdict)?;
+    let why = if strays.at_changes {
+        "at changes of range, as range-handover does, but too few here to name it"
+    } else {
+        why_astray(strays.count as f64 / read.len() as f64, verdict)?
+    };
     let of_what = if shown.model.members.is_empty() {
         ""
     } else {

@@ -1,0 +1,140 @@
+//! An end of the range that one swing of the current reaches and no other: the rest of the drive says nothing of it.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+mod common;
+
+use common::{noise, said};
+use twin::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
+use twin::report::data::{Report, Verdict};
+
+const ROWS: usize = 4000;
+const STEP_S: f64 = 0.1;
+const NOISE_A: f64 = 0.5;
+/// The swing's middle, half its width and its height.
+const SWING: (f64, f64, f64) = (262.0, 2.5, 240.0);
+
+/// Load steps of a quarter of the range that are low-passed, and one swing beyond them.
+fn current(seed: u64) -> Vec<f64> {
+    let mut step = noise(seed, 40.0);
+    let (mut target, mut now) = (0.0, 0.0);
+    (0..ROWS)
+        .map(|row| {
+            if row % 37 == 0 {
+                target = step();
+            }
+            now += 0.2 * (target - now);
+            let (middle_s, half_s, height) = SWING;
+            let x = (row as f64 * STEP_S - middle_s) / half_s;
+            now + (height - now) * (1.0 - x * x).max(0.0)
+        })
+        .collect()
+}
+
+/// What is said of a sensor that makes `reading` of the current with its noise, which comes before or after that.
+fn explained(seed: u64, noise_before: bool, reading: impl Fn(f64) -> f64) -> Report {
+    let current = current(seed);
+    let mut noise = noise(seed + 100, NOISE_A);
+    let t_s: Vec<f64> = (0..ROWS).map(|row| row as f64 * STEP_S).collect();
+    let value = current
+        .iter()
+        .map(|i| match noise_before {
+            true => reading(i + noise()),
+            false => reading(*i) + noise(),
+        })
+        .collect();
+    let problem = Problem {
+        view: View::Sensor,
+        name: "i_meas_a".into(),
+        unit: "A".into(),
+        drive: Drive {
+            t_s: t_s.clone().into(),
+            reference: current.into(),
+            segments: std::iter::once(0..ROWS).collect(),
+            continues: vec![false],
+            ..Drive::default()
+        },
+        observed: Observed::with_drive(t_s, value),
+        base: Base::Sensor(SensorBase::default()),
+        modelled: Vec::new(),
+        noise: NOISE_A,
+        coloured: Coloured::default(),
+        accuracy: Accuracy::default(),
+    };
+    said(problem, seed, &[])
+}
+
+#[test]
+fn a_core_that_saturates_once_is_not_certainly_a_rail() {
+    let (knee_a, softness) = (150.0, 1.2);
+    let mut covered = 0;
+    for seed in 0..6 {
+        let report = explained(seed, false, |i| {
+            let beyond = (i.abs() - knee_a).max(0.0);
+            i.signum() * (i.abs().min(knee_a) + beyond / (1.0 + beyond / (softness * knee_a)))
+        });
+        let [effect] = report.effects.as_slice() else {
+            panic!("{seed}: {:?}", report.summary);
+        };
+        assert_eq!(effect.id, "core-saturation", "{seed}: {}", report.summary);
+        let [low, high] = effect.parameters[0].ci95;
+        covered += usize::from((low..=high).contains(&knee_a));
+    }
+    assert!(covered >= 5, "{covered} of 6");
+}
+
+#[test]
+fn a_rail_that_readings_stay_at_is_seen_without_any_other_swing() {
+    const HIGH_A: f64 = 180.0;
+    for seed in 0..6 {
+        let report = explained(seed, true, |i| i.min(HIGH_A));
+        let [effect] = report.effects.as_slice() else {
+            panic!("{seed}: {:?}", report.summary);
+        };
+        assert_eq!(effect.id, "clipping", "{seed}: {}", report.summary);
+        assert_eq!(
+            report.verdict,
+            Verdict::Explained,
+            "{seed}: {:?} {:?}",
+            report.summary,
+            report.decisions
+        );
+        // The other rail no reading reaches: it is not told.
+        let [high_a] = effect.parameters.as_slice() else {
+            panic!("{seed}: {:?}", effect.parameters);
+        };
+        let [low, high] = high_a.ci95;
+        assert!((low..=high).contains(&HIGH_A), "{seed}: {high_a:?}");
+    }
+}
+
+#[test]
+fn a_rail_ahead_of_the_noise_is_no_certain_core() {
+    for seed in 0..6 {
+        let report = explained(seed, false, |i| i.min(180.0));
+        let named: Vec<&str> = report
+            .effects
+            .iter()
+            .flat_map(|effect| std::iter::once(&effect.id).chain(&effect.equivalent_to))
+            .map(String::as_str)
+            .collect();
+        assert!(
+            named.contains(&"clipping"),
+            "{seed}: {named:?} {}",
+            report.summary
+        );
+    }
+}
+
+#[test]
+fn a_current_that_stays_at_its_highest_value_is_no_rail() {
+    // Charging at a constant current, told in steps: both hold the value, and agree.
+    for seed in 0..6 {
+        let report = explained(seed, true, |i| (i / 0.25).round() * 0.25);
+        assert!(
+            report.effects.iter().all(|effect| effect.id != "clipping"),
+            "{seed}: {}",
+            report.summary
+        );
+    }
+}
