@@ -10,8 +10,9 @@
 //! **Change**: [`ConfigurationStore::stage`] hands out a copy, [`ConfigurationStore::commit`] judges it whole and then
 //! puts it in force. So a refused change leaves nothing behind, whether it came over Modbus or from flash.
 //!
-//! **In memory**: the active configuration carries its CRC. [`ConfigurationStore::verify`], called at least once a
-//! second, replaces a corrupted one by the factory's and says so; a corrupted one is never the base of a change.
+//! **In memory**: the active configuration carries its CRC, which [`ConfigurationStore::stage`] checks, called at least
+//! once a second. A corrupted one is never the base of a change; [`ConfigurationStore::load`] puts the stored one in its
+//! place.
 
 mod fields;
 
@@ -470,7 +471,7 @@ pub struct Corrupted;
 pub enum CommitError {
     /// The new configuration may not be used.
     Invalid(Violation),
-    /// The active one is damaged: [`ConfigurationStore::verify`] first.
+    /// The active one is damaged: [`ConfigurationStore::load`] first.
     Corrupted,
 }
 
@@ -565,41 +566,27 @@ impl ConfigurationStore {
     ///
     /// # Errors
     /// Why not; then nothing has changed.
-    pub fn commit(&mut self, mut staged: Configuration) -> Result<(), CommitError> {
+    pub fn commit(&mut self, staged: Configuration) -> Result<(), CommitError> {
         self.active
             .verify()
             .map_err(|Corrupted| CommitError::Corrupted)?;
-        staged.derive();
-        staged.validate().map_err(CommitError::Invalid)?;
-        self.replace(staged);
-        Ok(())
+        self.load(staged).map_err(CommitError::Invalid)
     }
 
-    /// Puts the configuration of a record in force.
+    /// Puts a configuration in force that was not made from the active one, which may be damaged: the stored one.
     ///
     /// # Errors
-    /// Why not; then nothing has changed.
-    pub fn load(&mut self, record: &[u8]) -> Result<(), ConfigurationError> {
-        self.replace(decode(record)?);
+    /// Why it may not be used; then nothing has changed.
+    pub fn load(&mut self, mut configuration: Configuration) -> Result<(), Violation> {
+        configuration.derive();
+        configuration.validate()?;
+        self.replace(configuration);
         Ok(())
     }
 
     /// Puts the factory's configuration in force.
     pub fn factory_defaults(&mut self) {
         self.replace(Configuration::default());
-    }
-
-    /// Checks the memory of the active configuration; the factory's takes the place of a damaged one.
-    ///
-    /// # Errors
-    /// [`Corrupted`] when it was damaged: a fault to report, and a change like any other for those who keep something
-    /// made from it.
-    pub fn verify(&mut self) -> Result<(), Corrupted> {
-        let result = self.active.verify();
-        if result.is_err() {
-            self.factory_defaults();
-        }
-        result
     }
 
     /// Flips a bit behind the store's back.
@@ -1118,21 +1105,25 @@ mod tests {
             }))
         ));
         assert_eq!(
-            store.load(&[1, 2, 3]),
+            decode(&[1, 2, 3]),
             Err(ConfigurationError::TooShort {
                 needed: 8,
                 found: 3
             })
         );
+        assert!(matches!(
+            store.load(staged),
+            Err(Violation::OutOfLimits { value: 0, .. })
+        ));
         assert_eq!((*store.active(), store.generation()), (before, 0));
         assert_eq!(store.crc(), before.crc());
         staged.rtu.address = 9;
         assert_eq!(store.commit(staged), Ok(()));
         assert_eq!((store.active().rtu.address, store.generation()), (9, 1));
         assert_eq!(store.crc(), staged.crc());
-        assert_eq!(store.load(&record(&before)), Ok(()));
+        assert_eq!(store.load(decode(&record(&before)).unwrap()), Ok(()));
         assert_eq!((*store.active(), store.generation()), (before, 2));
-        assert_eq!(store.verify(), Ok(()));
+        assert_eq!(store.stage(), Ok(&before));
         assert_eq!(store.generation(), 2);
         store.commit(staged).unwrap();
         store.factory_defaults();
@@ -1144,7 +1135,7 @@ mod tests {
 
     /// F22.
     #[test]
-    fn a_corrupted_configuration_gives_way_to_the_factory_s_and_is_never_built_upon() {
+    fn a_corrupted_configuration_gives_way_to_the_stored_one_and_is_never_built_upon() {
         let mut good = Configuration::default();
         good.rtu.address = 17;
         let mut store = ConfigurationStore::default();
@@ -1153,10 +1144,14 @@ mod tests {
         assert_eq!(store.stage(), Err(Corrupted));
         assert_eq!(store.commit(good), Err(CommitError::Corrupted));
         assert_eq!(store.generation(), 1);
-        assert_eq!(store.verify(), Err(Corrupted));
-        assert_eq!(*store.active(), Configuration::default());
-        assert_eq!(store.generation(), 2);
-        assert_eq!(store.verify(), Ok(()));
+        assert_eq!(store.load(good), Ok(()));
+        assert_eq!((store.stage(), store.generation()), (Ok(&good), 2));
+        // Where nothing is stored.
+        store.corrupt();
+        assert_eq!(store.stage(), Err(Corrupted));
+        store.factory_defaults();
+        assert_eq!(store.stage(), Ok(&Configuration::default()));
+        assert_eq!(store.generation(), 3);
         // So is what follows from other settings, and the kept CRC.
         let currents: [fn(&mut Configuration) -> &mut Microamps; 4] = [
             |c| &mut c.meter.full_scale.small,
@@ -1166,12 +1161,14 @@ mod tests {
         ];
         for current in currents {
             current(&mut store.active.configuration).0 ^= 1;
-            assert_eq!(store.verify(), Err(Corrupted));
-            assert_eq!(store.verify(), Ok(()));
+            assert_eq!(store.stage(), Err(Corrupted));
+            assert_eq!(store.load(good), Ok(()));
+            assert_eq!(store.stage(), Ok(&good));
         }
         store.active.crc ^= 1;
-        assert_eq!(store.verify(), Err(Corrupted));
-        assert_eq!(store.verify(), Ok(()));
+        assert_eq!(store.stage(), Err(Corrupted));
+        assert_eq!(store.load(good), Ok(()));
+        assert_eq!(store.stage(), Ok(&good));
     }
 
     proptest! {

@@ -211,10 +211,10 @@ diagnoses! {
     31 FlashFault: "A write, erase or check of the flash failed, or a stored record is damaged or was cut off.",
         "any failure after retries";
         0 ms, 0 ms, Error, UntilCleared, [] [] []
-    32 ConfigurationDefault: "The stored configuration was refused; defaults are in use.",
+    32 ConfigurationDefault: "The stored configuration was refused, or none was there for a lost one; defaults are in use.",
         "CRC, version or limits of the configuration record";
         0 ms, 0 ms, Error, UntilCleared, [] [] []
-    33 ConfigurationCorruptRam: "The configuration in RAM failed its check; it is loaded again or defaults are used.",
+    33 ConfigurationCorruptRam: "The configuration in RAM failed its check; nothing is valid until the stored one, or without one the defaults, are in use.",
         "CRC once a second";
         0 ms, 1000 ms, Critical, UntilCleared, [IMPLAUSIBLE] [IMPLAUSIBLE] [IMPLAUSIBLE]
     34 LogFull: "The log is full: every new record replaces the oldest.",

@@ -442,8 +442,11 @@ impl KeyCalibration {
     }
 
     fn follow_key(&mut self, config: &KeyCalibrationConfig, inputs: &KeyInputs, key: KeyState) {
-        let first = !self.started;
-        self.started = true;
+        let resumes = !self.started && inputs.hv_feedback;
+        // One look at two lines may err. Contactors that are closed so soon were closed before the start, since when there
+        // was no permit.
+        self.started |=
+            elapsed(self.withheld_since, inputs.now) >= milliseconds(config.key_off_debounce_ms);
         if key == KeyState::Off {
             if self.phase != KeyPhase::Off {
                 self.phase = KeyPhase::Off;
@@ -453,8 +456,8 @@ impl KeyCalibration {
             }
         } else if !config.enabled {
             self.phase = KeyPhase::Disabled;
-        } else if self.phase == KeyPhase::Off {
-            self.phase = if first && inputs.hv_feedback {
+        } else if self.phase == KeyPhase::Off || (resumes && self.phase == KeyPhase::Taking) {
+            self.phase = if resumes {
                 KeyPhase::Resumed
             } else {
                 KeyPhase::Taking
@@ -1095,6 +1098,17 @@ mod tests {
             car.run_ms(1_100).0.phase,
             KeyPhase::Failed(KeyRefusal::NoOffValue)
         );
+        // One wrong look at either line is made good by the next one, and no later than the key's debounce.
+        for (key, feedback) in [(false, true), (true, false)] {
+            for (looks_ms, permits) in [(10, true), (90, true), (100, false)] {
+                let mut car = Car::new(config());
+                (car.inputs.acc_line, car.inputs.hv_feedback) = (key, feedback);
+                assert!(!car.step().hv_permit);
+                car.wait_ms(looks_ms);
+                (car.inputs.acc_line, car.inputs.hv_feedback) = (true, true);
+                assert_eq!(car.step().hv_permit, permits, "{key} {looks_ms} ms");
+            }
+        }
         // Started with the key OFF and high voltage on: welded contactors.
         let mut car = Car::new(config());
         car.inputs.hv_feedback = true;

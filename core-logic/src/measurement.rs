@@ -1391,7 +1391,7 @@ impl Measurement {
             soc_validity: self.soc_validity(),
             diagnoses: self.diagnosis.reported().bits(),
             supply: environment.supply,
-            temperature: environment.sensor_temperature,
+            temperature: self.environment.sensor_temperature,
         }
     }
 

@@ -24,12 +24,12 @@ pub const SLOT_WORDS: usize = SLOT_BYTES / 4;
 /// Longest flash record of a [`RetainedState`].
 pub const MAX_STATE_BYTES: usize = 86;
 /// Longest flash record of a [`LogRecord`].
-pub const MAX_LOG_BYTES: usize = 63;
+pub const MAX_LOG_BYTES: usize = 64;
 
 /// First byte of a retained state: kind 0xA, version 1.
 const STATE: u8 = 0xA1;
-/// First byte of a log record: kind 0x5, version 1.
-const LOG: u8 = 0x51;
+/// First byte of a log record: kind 0x5, version 2.
+const LOG: u8 = 0x52;
 
 const CHECKSUM_BYTES: usize = 4;
 // Without a table: 1 KiB of flash is worth more than 20 µs at the lowest priority.
@@ -150,8 +150,8 @@ pub struct LogRecord {
     pub diagnoses: u64,
     /// Supply of the sensor.
     pub supply: Millivolts,
-    /// Temperature of the board.
-    pub temperature: MilliCelsius,
+    /// Temperature next to the sensors, where there is one.
+    pub temperature: Option<MilliCelsius>,
 }
 
 impl LogRecord {
@@ -444,7 +444,7 @@ mod tests {
             soc_validity: Validity::from_bits(0xFF),
             diagnoses: u64::MAX,
             supply: Millivolts(i32::MIN),
-            temperature: MilliCelsius(i32::MIN),
+            temperature: Some(MilliCelsius(i32::MIN)),
         }
     }
 
@@ -486,7 +486,7 @@ mod tests {
                 soc_validity: Validity::from_bits(bits[2]),
                 diagnoses,
                 supply: Millivolts(currents[2]),
-                temperature: MilliCelsius(currents[3]),
+                temperature: (bits[0] & 1 == 0).then_some(MilliCelsius(currents[3])),
             }
         }
     }
@@ -516,10 +516,10 @@ mod tests {
             charge: Nanocoulombs::from_coulombs(50_000),
             soc: Ppm(512_345),
             supply: Millivolts(5_003),
-            temperature: MilliCelsius(31_250),
+            temperature: Some(MilliCelsius(31_250)),
             ..LogRecord::default()
         };
-        assert_eq!(usual.encode(&mut buffer).unwrap().len(), 33);
+        assert_eq!(usual.encode(&mut buffer).unwrap().len(), 34);
     }
 
     #[test]

@@ -987,6 +987,9 @@ fn surroundings_are_sent_with_their_validity() {
     bench.run_ms(1_500);
     let sent = bench.measurement.environment();
     assert!(sent.sensor_temperature_validity.contains(Validity::STALE));
+    // 0 °C would be a temperature.
+    let record = bench.measurement.log_record(&bench.configuration, 1);
+    assert_eq!(record.temperature, None);
     assert!(sent.board_temperature_validity.is_valid());
     assert!(bench.has(Code::TemperatureOutOfRange));
     bench.environment.board_temperature = Some(MilliCelsius(-40_000));
@@ -1368,7 +1371,7 @@ fn readings_and_log_carry_what_is_on_the_bus() {
     assert_eq!(record.charge, readings.charge);
     assert_eq!(record.soc, readings.soc);
     assert_eq!(record.supply, Millivolts(5_000));
-    assert_eq!(record.temperature, MilliCelsius(25_000));
+    assert_eq!(record.temperature, Some(MilliCelsius(25_000)));
     assert_eq!(
         record.diagnoses,
         bench.measurement.diagnosis().reported().bits()

@@ -8,13 +8,17 @@ mod support;
 
 use core_logic::retained::{RetainedState, SLOT_WORDS, from_words, to_words};
 use core_logic::units::Nanocoulombs;
+use emulator::bus_view::validity;
 use emulator::image::{SRAM_LENGTH, SRAM_START};
 use emulator::mcu::rcc::ResetCause;
 use emulator::scenario::{Contactors, Row};
+use plant::ade7753::Flip;
 use plant::battery::{Battery, BatteryConfig};
 use support::{Bench, firmware};
 
 const STRINGS: f64 = 40.0;
+/// The ADE7753's register CHKSUM.
+const CHECKSUM: u8 = 0x3E;
 /// What the battery really holds at the beginning.
 const TRUE_SOC: f64 = 0.72;
 /// What the board believes, and how certain it is of it.
@@ -224,4 +228,39 @@ fn rest_after_a_drive_re_anchors_the_state_of_charge_which_survives_a_reset() {
         (kept_within - within - declared_pct).abs() <= 0.11,
         "{kept_within} after {within}"
     );
+}
+
+/// It goes on from the meter's charge: without that it stands still while the current flows.
+#[test]
+fn state_of_charge_is_not_valid_while_the_meter_does_not_answer() {
+    let firmware = firmware();
+    let row = Row::at_rest(0.0).with_current(50.0);
+    let mut bench = Bench::nominal(&firmware, row, Contactors::AlwaysClosed);
+    let capacity_c = bench.settings("capacity")[0] as f64 * 3.6;
+    believe(&mut bench, capacity_c);
+    bench.rig.machine.reset(ResetCause::Software);
+    bench.settle();
+    let before = bench.rig.view.soc_pct();
+    assert!(before.valid().is_some(), "{before:?}");
+    // Each read fails its checksum for a second: to the firmware a chip that counts, which nobody can read.
+    let now_s = bench.now_s();
+    bench.rig.machine.board(|board| {
+        for _ in 0..250 {
+            board.meter.flip_bits(now_s, CHECKSUM, Flip::Mask(1));
+        }
+    });
+    bench.until("MeterNoAnswer", 0.4, |rig| {
+        rig.view.active_diagnoses().contains(&"MeterNoAnswer")
+    });
+    // The frame.
+    bench.run(0.1);
+    let meanwhile = bench.rig.view.soc_pct();
+    bench.run(2.5);
+    let after = bench.rig.view.soc_pct();
+    println!("SoC: {before:?}, then {meanwhile:?}, then {after:?}");
+    assert!(
+        meanwhile.validity & validity::CHIP_FAULT != 0,
+        "{meanwhile:?}"
+    );
+    assert!(after.valid().is_some(), "{after:?}");
 }

@@ -56,6 +56,8 @@ pub struct Conditions {
     pub flash_fault: bool,
     /// The same, as long as the chip does not answer.
     pub flash_missing: bool,
+    /// What the last check of the configuration in RAM has found.
+    pub configuration_corrupt: bool,
     /// Set by the storage task.
     pub log_full: bool,
     /// Set by the supervision.
@@ -303,6 +305,10 @@ impl Center {
             (
                 Code::FlashFault,
                 core::mem::take(&mut self.conditions.flash_fault) | self.conditions.flash_missing,
+            ),
+            (
+                Code::ConfigurationCorruptRam,
+                self.conditions.configuration_corrupt,
             ),
             (
                 Code::LogFull,

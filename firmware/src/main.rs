@@ -49,7 +49,7 @@ mod app {
         converter::{ConverterSample, PollPace},
         design_parameters,
         diagnosis::Code,
-        front_end::Channel,
+        front_end::{Channel, KeyFactors},
         gap::GapBridge,
         measurement::{ConverterFault, Order},
         meter::{MeterChannel, MeterReport},
@@ -140,6 +140,17 @@ mod app {
         /// Generation of the configuration that the flash holds.
         saved: Option<u32>,
         flash_counters: [u32; 5],
+    }
+
+    impl Administration {
+        /// The settings show the factors in use, or a client could not set those that they show.
+        fn keep_key_factors(&mut self, factors: KeyFactors) {
+            let mut staged = *self.store.active();
+            if staged.key_factors != factors {
+                staged.key_factors = factors;
+                let _ = self.store.commit(staged);
+            }
+        }
     }
 
     #[shared]
@@ -693,15 +704,19 @@ mod app {
                     .lock(|center| center.conditions.rs485_errors = true);
             }
             let found = cx.shared.center.lock(|center| center.found.take());
-            let corrupt = elapsed(checked, now) >= Duration::from_ticks(1_000_000);
-            if corrupt {
+            let check = elapsed(checked, now) >= Duration::from_ticks(1_000_000);
+            if check {
                 checked = now;
             }
             let mut refused = found.is_some();
             let (active, crc, changed, mut damaged) =
                 cx.shared.administration.lock(|administration| {
                     let store = &mut administration.store;
-                    let damaged = corrupt && store.verify().is_err();
+                    let damaged = check && store.stage().is_err();
+                    if damaged {
+                        // An order that is being served comes first; the next check asks again.
+                        administration.request.get_or_insert(Command::Restore);
+                    }
                     if let Some(found) = found
                         && let Ok(active) = store.stage()
                     {
@@ -719,23 +734,21 @@ mod app {
                     .center
                     .lock(|center| center.measurement.found_was_refused());
             }
-            if changed {
-                apply(&mut cx, &active, crc);
-            } else if corrupt {
-                // What the measurement works with is a copy. Its CRC takes 0.5 ms, which the tick must not wait for.
+            // Until the stored one is there the measurement goes on with its own copy.
+            let mut renew = changed && !damaged;
+            if check && !changed && !damaged {
+                // Its CRC takes 0.5 ms, which the tick must not wait for.
                 let copy = cx.shared.center.lock(|center| center.configuration);
-                if copy.crc() != crc {
-                    apply(&mut cx, &active, crc);
-                    damaged = true;
-                }
+                damaged = copy.crc() != crc;
+                renew = damaged;
             }
-            if damaged {
-                cx.shared.center.lock(|center| {
-                    center
-                        .conditions
-                        .happened
-                        .set(Code::ConfigurationCorruptRam, true);
-                });
+            if renew {
+                apply(&mut cx, &active, crc);
+            }
+            if check {
+                cx.shared
+                    .center
+                    .lock(|center| center.conditions.configuration_corrupt = damaged);
             }
         }
     }
@@ -862,7 +875,7 @@ mod app {
         let configuration = cx.shared.administration.lock(|administration| {
             if let Stored::Value(configuration) | Stored::Older(configuration) = &stored {
                 // It was checked when it was decoded.
-                let _ = administration.store.commit(*configuration);
+                let _ = administration.store.load(*configuration);
                 administration.saved = Some(administration.store.generation());
             }
             *administration.store.active()
@@ -872,16 +885,10 @@ mod app {
         let mut first_save = !start.is_in_flash;
         let charge = start.state.map(|state| state.charge_total);
         let configuration = cx.shared.administration.lock(|administration| {
-            let store = &mut administration.store;
-            // The settings show the factors in use, or a client could not set those that they show.
-            if let Some(state) = &start.state
-                && state.key_factors != store.active().key_factors
-            {
-                let mut staged = *store.active();
-                staged.key_factors = state.key_factors;
-                let _ = store.commit(staged);
+            if let Some(state) = &start.state {
+                administration.keep_key_factors(state.key_factors);
             }
-            *store.active()
+            *administration.store.active()
         });
         let crc = configuration.crc();
         let calibration = cx.shared.center.lock(|center| {
@@ -1033,30 +1040,48 @@ mod app {
         administration: &mut impl rtic::Mutex<T = Administration>,
     ) -> bool {
         let request = administration.lock(|administration| administration.request);
+        let mut defaulted = false;
         let done = match request {
             None => return false,
             Some(Command::Save) => {
-                let (configuration, generation) = administration.lock(|administration| {
+                let staged = administration.lock(|administration| {
                     let store = &administration.store;
-                    (*store.active(), store.generation())
+                    store.stage().map(|active| (*active, store.generation()))
                 });
-                let done = storage.save_configuration(&configuration).await;
-                if done {
-                    administration.lock(|administration| administration.saved = Some(generation));
+                // A damaged one must not replace the one that is to be loaded again.
+                if let Ok((configuration, generation)) = staged {
+                    let done = storage.save_configuration(&configuration).await;
+                    if done {
+                        administration
+                            .lock(|administration| administration.saved = Some(generation));
+                    }
+                    done
+                } else {
+                    false
                 }
-                done
             }
-            Some(Command::Restore) => match storage.configuration().await {
-                Stored::Value(configuration) | Stored::Older(configuration) => {
-                    administration.lock(|administration| {
-                        let store = &mut administration.store;
-                        let done = store.commit(configuration).is_ok();
+            Some(Command::Restore) => {
+                let stored = storage.configuration().await;
+                let is_ready = storage.is_ready();
+                let in_use = center.lock(|center| center.measurement.retained(0).key_factors);
+                administration.lock(|administration| {
+                    let store = &mut administration.store;
+                    let is_lost = store.stage().is_err();
+                    let mut done = false;
+                    if let Stored::Value(configuration) | Stored::Older(configuration) = stored {
+                        done = store.load(configuration).is_ok();
                         administration.saved = Some(store.generation());
-                        done
-                    })
-                }
-                Stored::Nothing | Stored::Refused => false,
-            },
+                    } else if is_lost && is_ready {
+                        // As at a start. A chip that does not answer may still have one.
+                        store.factory_defaults();
+                        defaulted = true;
+                    }
+                    if is_lost {
+                        administration.keep_key_factors(in_use);
+                    }
+                    done
+                })
+            }
             // Of the three there is only this one left: the log is to be cleared.
             Some(_) => match storage.clear_log_sector().await {
                 Ok(true) => return true,
@@ -1069,7 +1094,15 @@ mod app {
         } else {
             CommandState::Failed
         };
-        center.lock(|center| center.measurement.note_command(state, 0));
+        center.lock(|center| {
+            center.measurement.note_command(state, 0);
+            if defaulted {
+                center
+                    .conditions
+                    .happened
+                    .set(Code::ConfigurationDefault, true);
+            }
+        });
         administration.lock(|administration| {
             // An order that has come meanwhile is still to be served.
             if administration.request == request {

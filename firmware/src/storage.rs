@@ -124,14 +124,13 @@ impl Storage {
         )
     }
 
-    /// One try to wake the chip, if it is not awake; whether it is. Without it nothing is read or written.
+    /// One try to wake the chip; whether it answers. Without it nothing is read or written: one that has gone reads as blank.
     pub async fn start(&mut self) -> bool {
-        if !self.ready {
-            match self.flash.start().await {
-                Ok(()) => self.ready = true,
-                Err(error) => defmt::debug!("flash: {}", error),
-            }
+        let result = self.flash.start().await;
+        if let Err(error) = &result {
+            defmt::debug!("flash: {}", error);
         }
+        self.ready = result.is_ok();
         self.ready
     }
 

@@ -13,7 +13,7 @@ fn fault_f22_a_flipped_bit_of_the_configuration_is_found_and_defaults_take_over(
     let copies = configurations_in_ram(&steady(20.0));
     println!("F22: {} copies of the configuration in RAM", copies.len());
     assert!(!copies.is_empty());
-    let mut found = 0;
+    let (mut found, mut defaulted) = (0, 0);
     for (number, address) in copies.iter().enumerate() {
         let mut rig = steady(20.0);
         rig.run_s(0.3).unwrap();
@@ -38,10 +38,13 @@ fn fault_f22_a_flipped_bit_of_the_configuration_is_found_and_defaults_take_over(
         if named_s.is_some() {
             found += 1;
             assert!(mended);
+            // Nothing is stored: the factory's settings, and that is said. The measurement's copy is renewed from the other.
+            defaulted += usize::from(was_raised(&rig, "ConfigurationDefault"));
         }
     }
     // The guarded one and the one that is measured with.
     assert!(found >= 2, "{found} of {} copies are watched", copies.len());
+    assert_eq!(defaulted, 1);
 }
 
 #[test]

@@ -1,5 +1,6 @@
-//! F19 … F21: the flash and the supply.
+//! F19 … F22: the flash and the supply, and what is had again from the flash.
 
+use emulator::faults::configurations_in_ram;
 use emulator::mcu::rcc::ResetCause;
 use emulator::rig::{Rig, Setup};
 use emulator::scenario::{Contactors, Key, Scenario};
@@ -540,6 +541,157 @@ fn fault_f20_a_flash_that_comes_too_late_for_the_start_is_used_all_the_same() {
     });
     assert_eq!(capacity(&mut rig), 100_000);
     assert_eq!(resets(&rig), 0);
+}
+
+/// Corrections by which 20 A read as 18 A, in ppm, of converter and meter: each one for both sensors.
+const GAIN_PPM: i32 = -100_000;
+const GAINS: [u16; 2] = [0x0216, 0x0500];
+const KEY_FACTORS: u16 = 0x0420;
+/// Voltages of the open-circuit table, of which F22 flips a bit.
+const OCV_VOLTAGE: u16 = 0x07AC;
+/// Whether the configuration in force is the one in flash.
+const SAVED: u16 = 0x002C;
+
+fn table(rig: &mut Rig<'_>) -> Vec<u16> {
+    holding_registers(rig, OCV_VOLTAGE, 42)
+}
+
+/// A flash with these corrections.
+fn calibrated_flash() -> Vec<u8> {
+    let mut rig = boot_parked(Vec::new(), Timing::TYPICAL, 0.0);
+    rig.run_s(0.6).unwrap();
+    let ppm = GAIN_PPM.cast_unsigned();
+    let words = [(ppm >> 16) as u16, ppm as u16].repeat(2);
+    for register in GAINS {
+        write_registers(&mut rig, register, &words).unwrap();
+    }
+    save(&mut rig);
+    content(&mut rig)
+}
+
+#[test]
+fn fault_f22_a_lost_configuration_is_loaded_again_and_nothing_else_is_valid_meanwhile() {
+    let flash = calibrated_flash();
+    let copies = configurations_in_ram(&boot_until(&flash, 1.8)).len();
+    assert!(copies >= 2);
+    let mut lost = 0;
+    // Each copy alone, and all at once.
+    for copy in (0..copies).map(Some).chain([None]) {
+        let fault = copy.map_or("F22".into(), |copy| format!("F22:{copy}"));
+        // The meter's mean is of a second.
+        let mut rig = boot_until(&flash, 1.8);
+        let before = table(&mut rig);
+        strike(&mut rig, &fault);
+        let (mut wrong, mut invalid_s, mut longest_s) = (0, 0.0, 0.0_f64);
+        watch(&mut rig, 4.0, |rig| {
+            let view = &rig.view;
+            for reading in [view.current_a(), view.average_a(), view.meter_current_a()] {
+                let valid_a = reading.valid();
+                wrong += usize::from(valid_a.is_some_and(|a| (a - 18.0).abs() > 0.3));
+            }
+            let valid = view.current_a().valid().is_some();
+            invalid_s = if valid { 0.0 } else { invalid_s + 1e-3 };
+            longest_s = longest_s.max(invalid_s);
+        });
+        println!(
+            "{fault}: {wrong} wrong values marked valid, no valid current for {longest_s:.2} s, {:?}, then {:?}",
+            unexpected(&rig, &[]),
+            rig.view.current_a()
+        );
+        assert_eq!(wrong, 0, "{fault}");
+        assert!(rig.view.current_a().valid().is_some());
+        assert_eq!(
+            unexpected(&rig, &["ConfigurationCorruptRam", "ChargeRestoredWithLoss"]),
+            Vec::<&str>::new()
+        );
+        assert_eq!(table(&mut rig), before, "{fault}");
+        assert_eq!(input_registers(&mut rig, SAVED, 1), [1], "{fault}");
+        if was_raised(&rig, "ConfigurationCorruptRam") {
+            lost += 1;
+            // From one check to the next, and the diagnosis's second.
+            assert!((1.0..=2.3).contains(&longest_s), "{fault}: {longest_s}");
+        }
+    }
+    assert!(lost >= 3, "{lost}");
+}
+
+/// At 20 A until `end_s`.
+fn boot_until(flash: &[u8], end_s: f64) -> Rig<'static> {
+    let mut rig = boot(flash.to_vec(), 20.0);
+    rig.run_s(end_s).unwrap();
+    rig
+}
+
+/// As over a reset: those of this turn of the key, saved or not.
+#[test]
+fn fault_f22_the_key_factors_in_use_stay() {
+    let mut rig = boot_parked(calibrated_flash(), Timing::TYPICAL, 0.0);
+    rig.run_s(0.6).unwrap();
+    let factors = [0x3B9A, 0xCA00, 0x0000, 0x01F4];
+    write_registers(&mut rig, KEY_FACTORS, &factors).unwrap();
+    rig.run_s(0.3).unwrap();
+    strike(&mut rig, "F22");
+    until_diagnosis(&mut rig, "ConfigurationCorruptRam", 1.3);
+    rig.run_s(0.3).unwrap();
+    assert_eq!(holding_registers(&mut rig, KEY_FACTORS, 4), factors);
+    let [high, low] = [GAIN_PPM >> 16, GAIN_PPM].map(|half| half as u16);
+    assert_eq!(holding_registers(&mut rig, GAINS[0], 2), [high, low]);
+    // Not all of it is saved.
+    assert_eq!(input_registers(&mut rig, SAVED, 1), [0]);
+}
+
+/// Before the damage is found: what is in flash is what the board is to have back.
+#[test]
+fn fault_f22_a_damaged_configuration_is_not_saved() {
+    let mut rig = boot_until(&calibrated_flash(), 0.6);
+    let before = table(&mut rig);
+    strike(&mut rig, "F22");
+    assert_ne!(table(&mut rig), before);
+    command(&mut rig, 7).unwrap();
+    rig.run_s(0.3).unwrap();
+    rig.power_cycle();
+    rig.run_s(0.5).unwrap();
+    assert_eq!(table(&mut rig), before);
+}
+
+/// Damaged in RAM, and the flash does not answer, not yet or no longer: it may still have the settings, so nothing is valid
+/// until it has told.
+#[test]
+fn fault_f22_a_lost_configuration_waits_for_the_flash() {
+    for is_late in [true, false] {
+        let mut rig = if is_late {
+            boot_late(5.0)
+        } else {
+            let mut rig = boot_until(&calibrated_flash(), 0.5);
+            board(&mut rig, |board| {
+                board.flash.power_off(0.5);
+                board.flash.power_on(5.0);
+            });
+            rig
+        };
+        rig.run_s(1.5).unwrap();
+        assert!(rig.view.active_diagnoses().contains(&"FlashFault"));
+        assert!(rig.view.current_a().valid().is_some());
+        strike(&mut rig, "F22");
+        until_diagnosis(&mut rig, "ConfigurationCorruptRam", 1.2);
+        rig.run_s(0.05).unwrap();
+        let mut valid = 0;
+        while rig.now_s() < 5.0 {
+            rig.run_s(0.01).unwrap();
+            valid += usize::from(rig.view.current_a().valid().is_some());
+        }
+        assert_eq!(valid, 0);
+        // Asked for it once a second, checked once a second, the diagnosis's second.
+        rig.run_s(3.5).unwrap();
+        println!("F22 without a flash: {:?}", unexpected(&rig, &[]));
+        assert!(!rig.view.active_diagnoses().contains(&"FlashFault"));
+        let current_a = rig.view.current_a().valid().unwrap();
+        if is_late {
+            assert_eq!(capacity(&mut rig), 100_000);
+        } else {
+            assert!((current_a - 18.0).abs() < 0.3, "{current_a}");
+        }
+    }
 }
 
 /// The same with high voltage off; `shift_v` at the sensor's output looks like a current to the meter.
