@@ -568,7 +568,7 @@ mod tests {
             .iter()
             .map(|(effect, values)| (*effect, values.as_slice()))
             .collect();
-        chain::Chain::new(problem).run(&members, chain::Nuisance::default())
+        chain::Chain::new(problem).run(&members, &chain::Nuisance::default())
     }
 
     #[test]

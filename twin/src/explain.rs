@@ -12,6 +12,7 @@ pub mod locate;
 pub mod screen;
 pub mod select;
 pub mod shape;
+mod starts;
 mod told;
 mod trust;
 mod unfitted;
@@ -310,7 +311,7 @@ fn tell(
     report.models.push(fitted(problem, &selection.fit));
     report.remarks.extend(base_found(
         &problem.name,
-        selection.fit.model.nuisance,
+        &selection.fit.model.nuisance,
         &problem.base,
     ));
     report
@@ -500,5 +501,5 @@ pub fn predict(problem: &Problem, effects: &[(String, Vec<f64>)]) -> Vec<f64> {
         .iter()
         .filter_map(|(id, values)| Some((find_with(id, values.len())?, values.as_slice())))
         .collect();
-    Chain::new(problem).run(&members, Nuisance::default())
+    Chain::new(problem).run(&members, &Nuisance::default())
 }

@@ -6,6 +6,7 @@ use std::sync::{Arc, OnceLock};
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
+use super::starts;
 use super::workbench::{Model, Workbench};
 use crate::effects::Search;
 use crate::effects::chain::{Begun, Change};
@@ -42,7 +43,7 @@ const WORTH: f64 = 0.1;
 
 /// What the model file says of the base is off by this many of its own standard uncertainties at most: beyond them it is no
 /// uncertainty but physics that was left out, and has a name.
-pub(super) const BASE_OFF: f64 = 4.0;
+pub const BASE_OFF: f64 = 4.0;
 
 /// Whether a value of the base stands at that end, by how many of its standard uncertainties it is off.
 pub(super) fn at_base_end(deviations: f64) -> bool {
@@ -107,7 +108,8 @@ impl Fit {
 enum Coordinate {
     /// Member, parameter, and whether its logarithm is the coordinate.
     Value(usize, usize, bool),
-    SocShift,
+    /// Index of the start, among those of the bench.
+    SocShift(usize),
     Resistance,
     Alignment,
 }
@@ -117,7 +119,7 @@ impl Coordinate {
     fn change(self) -> Change {
         match self {
             Self::Value(member, _, _) => Change::Member(member),
-            Self::SocShift => Change::SocShift,
+            Self::SocShift(_) => Change::SocShift,
             Self::Resistance => Change::Resistance,
             Self::Alignment => Change::Alignment,
         }
@@ -216,7 +218,13 @@ impl Slope {
     }
 
     /// Carries the slope along a step (Broyden's update): cheaper than a new one, and nearly as good for small steps.
-    fn learn(&mut self, step: &[f64], before: &[f64], after: &[f64], model: &Model) {
+    fn learn(
+        &mut self,
+        bench: &Workbench<'_>,
+        step: &[f64],
+        [before, after]: [&[f64]; 2],
+        model: &Model,
+    ) {
         let scaled: Vec<f64> = self
             .columns
             .iter()
@@ -246,10 +254,29 @@ impl Slope {
         }
         for (coordinate, at) in self.coordinates.iter().zip(&mut self.at) {
             *at = match coordinate {
-                Coordinate::SocShift => model.nuisance.soc_shift,
+                Coordinate::SocShift(start) => bench.starts[*start].at(&model.nuisance),
                 Coordinate::Resistance => model.nuisance.resistance,
                 _ => *at,
             };
+        }
+    }
+
+    /// Leaves starts where they are of which the readings in use do not tell, by the index of each and its coordinate: how an
+    /// operation began is no physics that another one could tell.
+    fn keep(
+        &self,
+        normal: &mut DMatrix<f64>,
+        right: &mut DVector<f64>,
+        untold: impl Fn(usize, usize) -> bool,
+    ) {
+        for (k, coordinate) in self.coordinates.iter().enumerate() {
+            if let Coordinate::SocShift(start) = coordinate
+                && untold(*start, k)
+            {
+                normal.row_mut(k).fill(0.0);
+                normal.column_mut(k).fill(0.0);
+                right[k] = 0.0;
+            }
         }
     }
 
@@ -262,10 +289,10 @@ impl Slope {
     }
 }
 
-/// Standard uncertainties of the base: of the initial state of charge, and of the resistance as a share of it.
-fn base_sigmas(bench: &Workbench<'_>) -> Option<(f64, f64)> {
+/// Standard uncertainty of the resistance, as a share of it.
+fn resistance_sigma(bench: &Workbench<'_>) -> Option<f64> {
     match &bench.problem.base {
-        Base::Battery(base) => Some((base.initial_soc_sigma, base.resistance_sigma)),
+        Base::Battery(base) => Some(base.resistance_sigma),
         Base::Sensor(_) => None,
     }
 }
@@ -293,14 +320,9 @@ fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta
             };
             *value = value.clamp(low.min(high), high.max(low));
         }
-        Coordinate::SocShift => {
-            let most = base_sigmas(bench)
-                .map_or(1.0, |(soc, _)| BASE_OFF * soc)
-                .min(1.0);
-            model.nuisance.soc_shift = (model.nuisance.soc_shift + delta).clamp(-most, most);
-        }
+        Coordinate::SocShift(start) => bench.starts[start].shift(&mut model.nuisance, delta),
         Coordinate::Resistance => {
-            let most = base_sigmas(bench).map_or(5.0, |(_, resistance)| BASE_OFF * resistance);
+            let most = resistance_sigma(bench).map_or(5.0, |sigma| BASE_OFF * sigma);
             let resistance = model.nuisance.resistance + delta;
             model.nuisance.resistance = resistance.clamp((-most).max(-0.9), most);
         }
@@ -340,12 +362,12 @@ fn coordinates(bench: &Workbench<'_>, model: &Model) -> Vec<(Coordinate, f64, f6
     }
     if let Base::Battery(base) = &bench.problem.base {
         let inverse = |sigma: f64| 1.0 / (sigma * sigma);
-        if base.initial_soc_sigma > 0.0 {
+        for (index, start) in bench.starts.iter().enumerate() {
             all.push((
-                Coordinate::SocShift,
-                1e-5,
-                inverse(base.initial_soc_sigma),
-                model.nuisance.soc_shift,
+                Coordinate::SocShift(index),
+                starts::SMALL,
+                inverse(start.sigma),
+                start.at(&model.nuisance),
             ));
         }
         if base.resistance_sigma > 0.0 && bench.problem.view == crate::problem::View::Voltage {
@@ -445,6 +467,33 @@ fn unrounded(bench: &Workbench<'_>, model: &Model) -> Option<(Model, Vec<f64>)> 
     })
 }
 
+/// Coordinates that are moved in one run: each by itself but for the starts, of which no operation knows another's.
+fn runs<'k>(
+    coordinates: &[(Coordinate, f64, f64, f64)],
+    some: &'k [usize],
+) -> impl Iterator<Item = &'k [usize]> {
+    let is_start = |k: &usize| matches!(coordinates[*k].0, Coordinate::SocShift(_));
+    some.chunk_by(move |a, b| is_start(a) && is_start(b))
+}
+
+/// Of a run in which some coordinates were moved, what each of them does.
+fn apart(
+    bench: &Workbench<'_>,
+    coordinates: &[(Coordinate, f64, f64, f64)],
+    together: &[usize],
+    varied: Vec<f64>,
+    predicted: &[f64],
+) -> Vec<(usize, Vec<f64>)> {
+    let own = |k: &usize| match coordinates[*k].0 {
+        Coordinate::SocShift(start) => (*k, bench.starts[start].own(&varied, predicted)),
+        _ => (*k, varied.clone()),
+    };
+    match together {
+        [only] => vec![(*only, varied)],
+        several => several.iter().map(own).collect(),
+    }
+}
+
 /// The slope at a model.
 fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
     let residual = bench.residual(predicted);
@@ -470,16 +519,25 @@ fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
         if missing.is_empty() {
             break;
         }
-        let moved: Vec<(Change, Model)> = missing
-            .iter()
-            .map(|k| {
-                let (coordinate, step, _, _) = coordinates[*k];
+        let moved: Vec<(Change, Model)> = runs(&coordinates, &missing)
+            .map(|together| {
                 let mut moved = model.clone();
-                shift(bench, &mut moved, coordinate, sign * step);
-                (coordinate.change(), moved)
+                for k in together {
+                    shift(
+                        bench,
+                        &mut moved,
+                        coordinates[*k].0,
+                        sign * coordinates[*k].1,
+                    );
+                }
+                (coordinates[together[0]].0.change(), moved)
             })
             .collect();
-        for (k, mut column) in missing.into_iter().zip(bench.vary(model, &moved)) {
+        let varied = bench.vary(model, &moved);
+        let parts = runs(&coordinates, &missing)
+            .zip(varied)
+            .flat_map(|(together, varied)| apart(bench, &coordinates, together, varied, predicted));
+        for (k, mut column) in parts {
             let per_step = sign / coordinates[k].1;
             let mut any = false;
             for (there, here) in column.iter_mut().zip(predicted) {
@@ -503,6 +561,18 @@ fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
     slope
 }
 
+/// The rows from the first to the last that is not nothing, in whole lanes: sums over them are the same to the last digit.
+fn reach(column: &[f64], start: usize) -> std::ops::Range<usize> {
+    let is_some = |value: &f64| *value != 0.0;
+    let first = column.iter().position(is_some).unwrap_or(column.len());
+    let last = column
+        .iter()
+        .rposition(is_some)
+        .map_or(first, |last| last + 1);
+    let last = last.next_multiple_of(LANES).min(column.len());
+    start + first - first % LANES..start + last
+}
+
 /// Normal equations over some rows: JᵀWJ and JᵀWr.
 pub fn normal(
     columns: &[Vec<f64>],
@@ -514,16 +584,27 @@ pub fn normal(
     let mut matrix = DMatrix::zeros(size, size);
     let mut right = DVector::zeros(size);
     let mut weighted = vec![0.0; rows.len()];
+    // Where an operation begins tells in its own rows alone.
+    let reaches: Vec<std::ops::Range<usize>> = columns
+        .iter()
+        .map(|column| reach(&column[rows.clone()], rows.start))
+        .collect();
     for a in 0..size {
-        let column = &columns[a][rows.clone()];
-        for ((out, value), weight) in weighted.iter_mut().zip(column).zip(&weights[rows.clone()]) {
+        let own = reaches[a].clone();
+        let weighted = &mut weighted[..own.len()];
+        let pairs = columns[a][own.clone()].iter().zip(&weights[own.clone()]);
+        for (out, (value, weight)) in weighted.iter_mut().zip(pairs) {
             *out = value * weight;
         }
-        right[a] = dot(&weighted, &residual[rows.clone()]);
+        right[a] = dot(weighted, &residual[own.clone()]);
         for b in 0..=a {
-            let sum = dot(&weighted, &columns[b][rows.clone()]);
-            matrix[(a, b)] = sum;
-            matrix[(b, a)] = sum;
+            let (from, to) = (own.start.max(reaches[b].start), own.end.min(reaches[b].end));
+            if from < to {
+                let here = &weighted[from - own.start..to - own.start];
+                let sum = dot(here, &columns[b][from..to]);
+                matrix[(a, b)] = sum;
+                matrix[(b, a)] = sum;
+            }
         }
     }
     (matrix, right)
@@ -768,6 +849,11 @@ fn descend(aim: Aim<'_, '_>, here: &mut Point, known: Option<Slope>) -> Option<S
         let (mut matrix, mut right) =
             normal(&slope.columns, &weights, &here.residual, 0..bench.len());
         slope.penalty(&mut matrix, &mut right);
+        if let Some(used) = used {
+            slope.keep(&mut matrix, &mut right, |start, _| {
+                !bench.starts[start].told_by(used)
+            });
+        }
         let mut gain = 0.0;
         for _ in 0..6 {
             let step = solve(&matrix, &right, damping);
@@ -777,12 +863,8 @@ fn descend(aim: Aim<'_, '_>, here: &mut Point, known: Option<Slope>) -> Option<S
             let less = aim.cost(&there.model, &there.residual);
             if less < cost {
                 gain = (cost - less) / cost.max(1e-300);
-                slope.learn(
-                    step.as_slice(),
-                    &here.predicted,
-                    &there.predicted,
-                    &there.model,
-                );
+                let predicted = [here.predicted.as_slice(), &there.predicted];
+                slope.learn(bench, step.as_slice(), predicted, &there.model);
                 (*here, cost) = (there, less);
                 damping = (damping * 0.2).max(1e-9);
                 break;
@@ -1004,11 +1086,15 @@ pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<Vec<f64>> {
             let step = if size == 0 {
                 DVector::zeros(0)
             } else {
-                solve(
-                    &(&total - &blocked.matrices[block]),
-                    &(&right - &blocked.rights[block]),
-                    1e-9,
-                )
+                let here = &blocked.matrices[block];
+                let (mut matrix, mut right) = (&total - here, &right - &blocked.rights[block]);
+                if bench.starts.len() > 1 {
+                    blocked.slope.keep(&mut matrix, &mut right, |_, k| {
+                        let all = total[(k, k)] - blocked.slope.prior[k];
+                        starts::within_block(here[(k, k)], all)
+                    });
+                }
+                solve(&matrix, &right, 1e-9)
             };
             rows.clone()
                 .map(|row| {
