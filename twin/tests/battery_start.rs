@@ -1,128 +1,18 @@
 //! At which state of charge a battery begins: files that were never fitted, each operation of a log, and what is stated but not so.
-//!
-//! The cell is made here, by loops of this file on a grid ten times finer than the rows. Evidence of kind (d): our own simulator; it
-//! guards against regressions and proves nothing more.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+#[path = "common/cell.rs"]
+mod cell;
 #[path = "common/command.rs"]
 mod command;
 mod common;
 
 use std::fs;
 
+use cell::{AS_DESIGNED, Cell, NOISE_V, log, model, names, open_circuit_v, operation, said};
 use command::twin;
 use common::noise;
-use serde_json::Value;
-
-const ROWS: usize = 2400;
-const FINE: usize = 10;
-const NOISE_V: f64 = 0.001;
-const DESIGN_AH: f64 = 3.0;
-const DESIGN_OHM: f64 = 0.03;
-
-fn open_circuit_v(soc: f64) -> f64 {
-    3.0 + 1.1 * soc + 0.05 * (5.0 * soc).sin()
-}
-
-/// A cell and how it is recorded.
-#[derive(Clone, Copy)]
-struct Cell {
-    capacity_ah: f64,
-    resistance_ohm: f64,
-    /// A branch of 60 s, in Ω.
-    slow_ohm: f64,
-}
-
-const AS_DESIGNED: Cell = Cell {
-    capacity_ah: DESIGN_AH,
-    resistance_ohm: DESIGN_OHM,
-    slow_ohm: 0.0,
-};
-
-/// Rows of one operation from a state of charge on, the first reading off by so much.
-fn operation(cell: Cell, soc: f64, first_v: f64, cycle: usize, seed: u64) -> String {
-    let mut load_a = noise(seed, 4.0);
-    let mut noise_v = noise(seed + 1000, NOISE_V);
-    let (mut soc, mut slow_a, mut target_a, mut current_a) = (soc, 0.0, 0.0, 0.0);
-    let mut text = String::new();
-    for k in 0..ROWS * FINE {
-        if k % (25 * FINE) == 0 {
-            target_a = if k == 0 { 0.0 } else { 2.0 + load_a() };
-        }
-        if k % FINE == 0 {
-            let error_v = if k == 0 { first_v } else { noise_v() };
-            let volts =
-                open_circuit_v(soc) - cell.resistance_ohm * current_a - cell.slow_ohm * slow_a;
-            text.push_str(&format!(
-                "{},{cycle},{current_a:.5},{:.5}\n",
-                k / FINE,
-                volts + error_v
-            ));
-        }
-        let before_a = current_a;
-        // From row to row in straight lines, as a recording is read: the load changes within a second.
-        let step_a = (target_a - current_a) / (FINE - k % FINE) as f64;
-        current_a += step_a;
-        let dt = 1.0 / FINE as f64;
-        let mean_a = 0.5 * (before_a + current_a);
-        soc -= mean_a * dt / 3600.0 / cell.capacity_ah;
-        slow_a += (mean_a - slow_a) * (1.0 - (-dt / 60.0).exp());
-    }
-    text
-}
-
-fn log(operations: &[String]) -> String {
-    format!("t_s,cycle,i_ref_a,v_cell_v\n{}", operations.concat())
-}
-
-fn model(more: &str) -> String {
-    let table: Vec<String> = (0..=400)
-        .map(|k| f64::from(k) / 400.0)
-        .map(|soc| format!("[{soc}, {:.6}]", open_circuit_v(soc)))
-        .collect();
-    format!(
-        "schema = 1\n[battery]\ncapacity_ah = {DESIGN_AH}\nohmic_resistance_ohm = {DESIGN_OHM}\nnoise_v = {NOISE_V}\n{more}\nocv = [{}]\n",
-        table.join(", ")
-    )
-}
-
-/// What is said of a recording under a model, beside a file that is never fitted.
-fn said(model: &str, fitted: &str, other: Option<&str>) -> Value {
-    let folder = tempfile::tempdir().unwrap();
-    let folder = folder.path();
-    let write = |name: &str, text: &str| fs::write(folder.join(name), text).unwrap();
-    write("m.toml", model);
-    write("r.csv", fitted);
-    let mut arguments = vec![
-        "explain",
-        "--model",
-        "m.toml",
-        "--recording",
-        "r.csv",
-        "--out",
-        "out",
-    ];
-    if let Some(other) = other {
-        write("h.csv", other);
-        arguments.extend(["--holdout", "h.csv"]);
-    }
-    let output = twin(folder, &arguments);
-    assert_eq!(
-        output.status.code(),
-        Some(0),
-        "{}",
-        String::from_utf8_lossy(&output.stderr)
-    );
-    serde_json::from_str(&fs::read_to_string(folder.join("out/report.json")).unwrap()).unwrap()
-}
-
-fn names(report: &Value) -> Vec<&str> {
-    let effects = report["effects"].as_array().unwrap().iter();
-    effects
-        .map(|effect| effect["id"].as_str().unwrap())
-        .collect()
-}
 
 /// Cells with an effect that the design lacks.
 fn concealed() -> [(&'static str, Cell); 2] {

@@ -288,7 +288,7 @@ impl<'a> Chain<'a> {
             }
             Link::Terminals => {
                 if let Some(battery) = &mut scene.battery {
-                    battery.resistance = 1.0 + nuisance.resistance;
+                    battery.resistance *= 1.0 + nuisance.resistance;
                     if self.problem.view == View::StateOfCharge {
                         scene.signal = battery.soc.iter().map(|soc| 100.0 * soc).collect();
                     } else {

@@ -88,7 +88,7 @@ pub struct Battery<'a> {
     pub efficiency: f64,
     /// Added to the state of charge at the start of each operation, 0 … 1; nothing where there is no value.
     pub soc_shift: Vec<f64>,
-    /// Factor of the ohmic resistance by design.
+    /// Factor of the ohmic resistance by design, at 25 °C.
     pub resistance: f64,
     /// State of charge, 0 … 1; filled between the stages of charge and temperature.
     pub soc: Series,

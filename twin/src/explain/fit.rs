@@ -261,18 +261,27 @@ impl Slope {
         }
     }
 
-    /// Leaves starts where they are of which the readings in use do not tell, by the index of each and its coordinate: how an
+    /// Leaves coordinates where they are: values beyond which nothing means anything (a knee at full charge) that would go there
+    /// (`at_ends` has the model, and which way each would go), and of the starts, by index and coordinate, those of which the readings in use do not tell: how an
     /// operation began is no physics that another one could tell.
     fn keep(
         &self,
-        normal: &mut DMatrix<f64>,
-        right: &mut DVector<f64>,
+        at_ends: Option<(&Model, &DVector<f64>)>,
+        (normal, right): (&mut DMatrix<f64>, &mut DVector<f64>),
         untold: impl Fn(usize, usize) -> bool,
     ) {
         for (k, coordinate) in self.coordinates.iter().enumerate() {
-            if let Coordinate::SocShift(start) = coordinate
-                && untold(*start, k)
-            {
+            let stays = match *coordinate {
+                Coordinate::Value(m, p, _) => at_ends.is_some_and(|(model, outward)| {
+                    let member = &model.members[m];
+                    let (low, high) = member.effect.card().parameters[p].limits;
+                    let value = member.values[p];
+                    (value <= low && outward[k] < 0.0) || (value >= high && outward[k] > 0.0)
+                }),
+                Coordinate::SocShift(start) => untold(start, k),
+                _ => false,
+            };
+            if stays {
                 normal.row_mut(k).fill(0.0);
                 normal.column_mut(k).fill(0.0);
                 right[k] = 0.0;
@@ -370,7 +379,8 @@ fn coordinates(bench: &Workbench<'_>, model: &Model) -> Vec<(Coordinate, f64, f6
                 start.at(&model.nuisance),
             ));
         }
-        if base.resistance_sigma > 0.0 && bench.problem.view == crate::problem::View::Voltage {
+        let is_voltage = bench.problem.view == crate::problem::View::Voltage;
+        if base.resistance_sigma > 0.0 && is_voltage && !model.says_resistance() {
             all.push((
                 Coordinate::Resistance,
                 1e-4,
@@ -743,6 +753,9 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
     if !bench.aligns(&model) {
         model.nuisance.alignment_s = 0.0;
     }
+    if model.says_resistance() {
+        model.nuisance.resistance = 0.0;
+    }
     let predicted = bench.run(&model);
     let mut here = Point::of(bench, model, predicted);
     let mut sigma = spread(&here.residual);
@@ -850,9 +863,8 @@ fn descend(aim: Aim<'_, '_>, here: &mut Point, known: Option<Slope>) -> Option<S
             normal(&slope.columns, &weights, &here.residual, 0..bench.len());
         slope.penalty(&mut matrix, &mut right);
         if let Some(used) = used {
-            slope.keep(&mut matrix, &mut right, |start, _| {
-                !bench.starts[start].told_by(used)
-            });
+            let untold = |start: usize, _| !bench.starts[start].told_by(used);
+            slope.keep(None, (&mut matrix, &mut right), untold);
         }
         let mut gain = 0.0;
         for _ in 0..6 {
@@ -1087,14 +1099,14 @@ pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<Vec<f64>> {
                 DVector::zeros(0)
             } else {
                 let here = &blocked.matrices[block];
-                let (mut matrix, mut right) = (&total - here, &right - &blocked.rights[block]);
-                if bench.starts.len() > 1 {
-                    blocked.slope.keep(&mut matrix, &mut right, |_, k| {
-                        let all = total[(k, k)] - blocked.slope.prior[k];
-                        starts::within_block(here[(k, k)], all)
-                    });
-                }
-                solve(&matrix, &right, 1e-9)
+                let (mut matrix, mut others) = (&total - here, &right - &blocked.rights[block]);
+                let untold = |_, k| {
+                    let all = total[(k, k)] - blocked.slope.prior[k];
+                    bench.starts.len() > 1 && starts::within_block(here[(k, k)], all)
+                };
+                let at_ends = Some((&fit.model, &right));
+                (blocked.slope).keep(at_ends, (&mut matrix, &mut others), untold);
+                solve(&matrix, &others, 1e-9)
             };
             rows.clone()
                 .map(|row| {

@@ -70,6 +70,13 @@ impl Model {
         self.members.iter().any(|member| member.id() == id)
     }
 
+    /// Whether one of its effects says what the ohmic resistance is.
+    pub fn says_resistance(&self) -> bool {
+        self.members
+            .iter()
+            .any(|member| member.effect.says_resistance())
+    }
+
     /// With one more effect.
     pub fn with(&self, member: Member) -> Self {
         let mut model = self.clone();
