@@ -5,6 +5,7 @@
 //! the recording or other files do not bear out, `verdict` says what that makes, and `told` puts the report together.
 //! Nothing here knows a file or an effect by name.
 
+mod elsewhere;
 pub mod fit;
 pub mod flexible;
 pub mod intervals;
@@ -256,6 +257,7 @@ fn tell(
         left,
         held,
         beside,
+        elsewhere,
         vetoed,
         ..
     } = decided;
@@ -324,7 +326,7 @@ fn tell(
     let mut sentence = sentence(
         bench,
         &selection,
-        (verdict, doubted),
+        (verdict, doubted, elsewhere.as_deref()),
         left,
         (&vetoed, report),
     );
@@ -351,6 +353,8 @@ struct Decided {
     beside: Option<f64>,
     /// Whether it was decided on what each reading says beyond those before it.
     on_white: bool,
+    /// See [`elsewhere::elsewhere`].
+    elsewhere: Option<String>,
     /// What was taken back for a file that was never fitted.
     vetoed: Vec<&'static str>,
 }
@@ -431,12 +435,23 @@ fn decide(
         not_there,
         unavoidable,
     );
+    // A file that was never fitted, with a start of its own, tells a start from physics.
+    let asked = verdict != Verdict::NoMismatch && (!confirmed || selection.named.is_empty());
+    let elsewhere = asked
+        .then(|| elsewhere::elsewhere(bench, &selection))
+        .flatten();
+    let verdict = if elsewhere.is_some() && !selection.named.is_empty() {
+        Verdict::Ambiguous
+    } else {
+        verdict
+    };
     Decided {
         selection,
         verdict,
         left,
         held,
         beside,
+        elsewhere,
         on_white: bench.is_white(),
         vetoed,
     }

@@ -141,3 +141,28 @@ fn each_operation_has_a_start_of_its_own() {
     }
     assert!(covered >= 6, "{covered} of 8");
 }
+
+#[test]
+fn a_stated_start_that_is_off_is_told_beside_what_imitates_it() {
+    for (begins, more) in [
+        (0.8, "initial_soc = 0.9"),
+        (0.88, "initial_soc = 0.9"),
+        (0.8, "initial_soc = 0.9\ninitial_soc_uncertainty = 0.01"),
+    ] {
+        for seed in 0..2 {
+            let fitted = log(&[operation(AS_DESIGNED, begins, 0.0, 0, seed)]);
+            let report = said(&model(more), &fitted, None);
+            let summary = report["summary"].as_str().unwrap();
+            let told = format!("at the start was {:.1} % and not 90.0 %", 100.0 * begins);
+            assert!(summary.contains(&told), "{summary}");
+            assert_ne!(report["verdict"], "explained", "{summary}");
+        }
+    }
+    // What is physics is not said to be a start.
+    for (id, cell) in concealed() {
+        let fitted = log(&[operation(cell, 0.9, 0.0, 0, 7)]);
+        let report = said(&model("initial_soc = 0.9"), &fitted, None);
+        assert_eq!(names(&report), [id], "{}", report["summary"]);
+        assert_eq!(report["verdict"], "explained", "{}", report["summary"]);
+    }
+}

@@ -180,11 +180,11 @@ pub(super) fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> 
     }
 }
 
-/// The verdict in one sentence; `vetoed` is what was taken back for a file that was never fitted.
+/// The verdict in one sentence; `elsewhere` is what another start would do, and `vetoed` is what was taken back for a file that was never fitted.
 pub(super) fn sentence(
     bench: &Workbench<'_>,
     selection: &Selection,
-    (verdict, doubted): (Verdict, bool),
+    (verdict, doubted, elsewhere): (Verdict, bool, Option<&str>),
     left: Explainable,
     (vetoed, report): (&[&str], &Report),
 ) -> String {
@@ -241,6 +241,10 @@ pub(super) fn sentence(
                 "what remains is louder than the stated noise".to_owned()
             }
         ),
+        Verdict::Ambiguous if let Some(elsewhere) = elsewhere => format!(
+            "{name}: explained by {} ({figures}), but without any physics as well {elsewhere}: initial_soc may be off.",
+            ids.join(" and ")
+        ),
         Verdict::Ambiguous if doubted => format!(
             "{name}: explained best by {} ({figures}), but not certainly: another physics of much the same shape may be behind it.",
             ids.join(" and ")
@@ -252,6 +256,9 @@ pub(super) fn sentence(
         Verdict::Unknown if !vetoed.is_empty() => format!(
             "{name}: there is a mismatch; here {} would account for it, but a file that was never fitted gets worse with it ({figures}).",
             vetoed.join(" and ")
+        ),
+        Verdict::Unknown if let Some(elsewhere) = elsewhere => format!(
+            "{name}: there is a mismatch, and no effect of the library accounts for it ({figures}); {elsewhere}: initial_soc may be off."
         ),
         Verdict::Unknown => format!(
             "{name}: there is a mismatch, and no effect of the library accounts for it ({figures})."
