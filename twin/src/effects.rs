@@ -29,6 +29,7 @@ mod polarisation;
 pub(crate) mod quantisation;
 mod range_handover;
 mod range_mismatch;
+mod resistance;
 mod resistance_soc;
 mod resistance_temperature;
 mod sampled_window;
@@ -41,7 +42,7 @@ use crate::problem::{Problem, View};
 use scene::{Scale, Scene};
 
 /// Every effect, in the order of the documentation's table.
-pub static LIBRARY: [&dyn Effect; 37] = [
+pub static LIBRARY: [&dyn Effect; 38] = [
     &offset::Offset,
     &gain::Gain,
     &offset_temperature::OffsetTemperature,
@@ -75,6 +76,7 @@ pub static LIBRARY: [&dyn Effect; 37] = [
     &diffusion::STRAIGHT_LINE,
     &diffusion::THROUGH_OCV,
     &ocv_hysteresis::OcvHysteresis,
+    &resistance::Resistance,
     &resistance_temperature::ResistanceTemperature,
     &resistance_soc::ResistanceSoc,
     &cell_self_heating::CellSelfHeating,
@@ -203,7 +205,7 @@ pub enum Stage {
     Output,
     /// Charge that the battery takes and gives.
     BatteryCharge,
-    /// What temperature does to the cell.
+    /// The ohmic resistance at 25 °C, and what temperature does to the cell.
     BatteryTemperature,
     /// What the cell does to its temperature: its resistance, and how that follows temperature, is known by then.
     BatteryHeat,
@@ -322,6 +324,11 @@ pub trait Effect: Sync {
 
     /// Whether it rounds readings to a grid: in the mean they follow what is ahead of it, though hardly one does at a time.
     fn rounds(&self) -> bool {
+        false
+    }
+
+    /// Whether it says what the ohmic resistance is: nothing of it is then left open by the model file.
+    fn says_resistance(&self) -> bool {
         false
     }
 
@@ -474,7 +481,7 @@ mod tests {
                 (id, names)
             })
             .collect();
-        let expected: [(&str, &[&str]); 31] = [
+        let expected: [(&str, &[&str]); 32] = [
             ("offset", &["offset_a"]),
             ("gain", &["gain"]),
             ("offset-temperature", &["tc_a_per_k"]),
@@ -508,6 +515,7 @@ mod tests {
             ),
             ("diffusion", &["r_ohm", "tau_s", "ocv_share"]),
             ("ocv-hysteresis", &["m_v", "gamma"]),
+            ("resistance", &["scale"]),
             ("resistance-temperature", &["b_k"]),
             ("resistance-soc", &["rise", "knee_soc"]),
             ("cell-self-heating", &["rth_k_per_w", "tau_s"]),
@@ -572,7 +580,7 @@ mod tests {
             .iter()
             .map(|(effect, values)| (*effect, values.as_slice()))
             .collect();
-        chain::Chain::new(problem).run(&members, chain::Nuisance::default())
+        chain::Chain::new(problem).run(&members, &chain::Nuisance::default())
     }
 
     #[test]
@@ -627,6 +635,7 @@ mod tests {
                 "polarisation" => [0.003, 5.0, 0.002, 20.0, 0.004, 60.0].to_vec(),
                 "diffusion" => vec![0.01, 50.0, 0.5],
                 "ocv-hysteresis" => vec![0.02, 300.0],
+                "resistance" => vec![1.6],
                 "resistance-temperature" => vec![2500.0],
                 "resistance-soc" => vec![2.0, 0.9],
                 "cell-self-heating" => vec![20.0, 30.0],

@@ -5,6 +5,7 @@
 //! the recording or other files do not bear out, `verdict` says what that makes, and `told` puts the report together.
 //! Nothing here knows a file or an effect by name.
 
+mod elsewhere;
 pub mod fit;
 pub mod flexible;
 pub mod intervals;
@@ -12,6 +13,7 @@ pub mod locate;
 pub mod screen;
 pub mod select;
 pub mod shape;
+mod starts;
 mod told;
 mod trust;
 mod unfitted;
@@ -255,6 +257,7 @@ fn tell(
         left,
         held,
         beside,
+        elsewhere,
         vetoed,
         ..
     } = decided;
@@ -310,7 +313,7 @@ fn tell(
     report.models.push(fitted(problem, &selection.fit));
     report.remarks.extend(base_found(
         &problem.name,
-        selection.fit.model.nuisance,
+        &selection.fit.model.nuisance,
         &problem.base,
     ));
     report
@@ -323,7 +326,7 @@ fn tell(
     let mut sentence = sentence(
         bench,
         &selection,
-        (verdict, doubted),
+        (verdict, doubted, elsewhere.as_deref()),
         left,
         (&vetoed, report),
     );
@@ -350,6 +353,8 @@ struct Decided {
     beside: Option<f64>,
     /// Whether it was decided on what each reading says beyond those before it.
     on_white: bool,
+    /// See [`elsewhere::elsewhere`].
+    elsewhere: Option<String>,
     /// What was taken back for a file that was never fitted.
     vetoed: Vec<&'static str>,
 }
@@ -430,12 +435,23 @@ fn decide(
         not_there,
         unavoidable,
     );
+    // A file that was never fitted, with a start of its own, tells a start from physics.
+    let asked = verdict != Verdict::NoMismatch && (!confirmed || selection.named.is_empty());
+    let elsewhere = asked
+        .then(|| elsewhere::elsewhere(bench, &selection))
+        .flatten();
+    let verdict = if elsewhere.is_some() && !selection.named.is_empty() {
+        Verdict::Ambiguous
+    } else {
+        verdict
+    };
     Decided {
         selection,
         verdict,
         left,
         held,
         beside,
+        elsewhere,
         on_white: bench.is_white(),
         vetoed,
     }
@@ -500,5 +516,5 @@ pub fn predict(problem: &Problem, effects: &[(String, Vec<f64>)]) -> Vec<f64> {
         .iter()
         .filter_map(|(id, values)| Some((find_with(id, values.len())?, values.as_slice())))
         .collect();
-    Chain::new(problem).run(&members, Nuisance::default())
+    Chain::new(problem).run(&members, &Nuisance::default())
 }

@@ -137,7 +137,7 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             reference: None,
             mapping: arguments.map.clone(),
         };
-        let other = prepare(&model, &inputs, Purpose::Compare)
+        let other = prepare(&model, &inputs, Purpose::HoldOut)
             .map_err(|failure| without_reference(failure, arguments.reference.is_some()))?;
         if let Some(signal) = copied(&prepared, &other) {
             return Err(Failure::Input(format!(
@@ -356,7 +356,7 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
                     .collect(),
             });
         }
-        shift.take(fitted.nuisance);
+        shift.take(&fitted.nuisance);
         shift.smooth_reference |= fitted.smooth_reference;
     }
     model.extended(&found, shift, file.parent().unwrap_or(Path::new("")), out)

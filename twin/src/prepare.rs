@@ -10,6 +10,7 @@ mod frame;
 mod held;
 mod phase;
 mod series;
+mod start;
 
 use std::{path::PathBuf, sync::Arc};
 
@@ -59,8 +60,17 @@ pub struct Inputs {
 pub enum Purpose {
     /// To compare: what was recorded of each signal has to be there, and plausible.
     Compare,
-    /// To simulate: the drive is enough.
+    /// To compare a file that is never fitted: the same, but it begins at a state of charge of its own.
+    HoldOut,
+    /// To simulate: the drive is enough. It begins as a file that is never fitted does.
     Simulate,
+}
+
+impl Purpose {
+    /// Whether readings are compared.
+    pub fn compares(self) -> bool {
+        matches!(self, Self::Compare | Self::HoldOut)
+    }
 }
 
 /// A problem and where its rows are from.
@@ -166,12 +176,12 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
     if items.is_empty() {
         return Err(nothing_to_compare(model, &frame));
     }
-    if purpose == Purpose::Compare {
+    if purpose.compares() {
         work.not_compared(&items);
     }
     for item in &mut items {
         model_effects(model, item)?;
-        if purpose == Purpose::Compare {
+        if purpose.compares() {
             checks::enough(&item.problem, frame.source())?;
         }
     }
@@ -257,7 +267,7 @@ impl<'a> Work<'a> {
     fn sensor(&mut self, sensor: &Sensor) -> Result<Vec<Item>, Failure> {
         let (reference, measured) = self.names(sensor)?;
         let column = self.frame.origin(&measured);
-        if self.purpose == Purpose::Compare
+        if self.purpose.compares()
             && self.reference.is_none()
             && self.frame.origin(&reference) == column
         {
@@ -270,7 +280,7 @@ impl<'a> Work<'a> {
         checks::some_values(found, &reference, self.drive_frame().source())?;
         let value = self.frame.column(&measured);
         let counter = self.charge_column();
-        if value.is_none() && (self.purpose == Purpose::Compare) && counter.is_none() {
+        if value.is_none() && self.purpose.compares() && counter.is_none() {
             // Asked for by name, or nothing else to do: the error names the columns that are there.
             if sensor.measured.is_some() || self.model.battery.is_none() {
                 self.frame.need(&measured)?;
@@ -278,7 +288,7 @@ impl<'a> Work<'a> {
             return Ok(Vec::new());
         }
         if let Some(value) = &value
-            && self.purpose == Purpose::Compare
+            && self.purpose.compares()
         {
             checks::some_values(value, &measured, self.frame.source())?;
             checks::not_constant(value, &measured, self.frame.source())?;
@@ -322,7 +332,7 @@ impl<'a> Work<'a> {
         if board.is_none() && sensor.interval_s == 0.0 {
             observed.held_s = fresh.interval_s.unwrap_or_default();
         }
-        if self.purpose == Purpose::Compare && value.is_some() {
+        if self.purpose.compares() && value.is_some() {
             let wild = checks::wild(&drive, &observed);
             let names = [reference.as_str(), measured.as_str()];
             let (errors, remarks) = (

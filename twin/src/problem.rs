@@ -229,8 +229,8 @@ pub struct BatteryBase {
     /// What a counter says to have flowed over the gap before each segment beyond a straight line through the current at the gap's
     /// ends, in Ah; 0, or no value, without one.
     pub gap_excess_ah: Vec<f64>,
-    /// Standard uncertainty of [`BatteryBase::initial_soc`], 0 … 1; 0: exact.
-    pub initial_soc_sigma: f64,
+    /// Standard uncertainty of [`BatteryBase::initial_soc`] at the start of each operation, 0 … 1; 0, or no value: exact.
+    pub initial_soc_sigma: Vec<f64>,
     /// Open-circuit voltage of the whole series string: state of charge (ascending) and V.
     pub ocv: Vec<(f64, f64)>,
     /// Cells in series in what the voltage is of.
@@ -336,6 +336,17 @@ impl Drive {
             operations.get(at).cloned().unwrap_or_else(|| rows.clone())
         };
         self.segments.iter().map(of_segment).collect()
+    }
+
+    /// Of each segment, the number of the operation that it is a part of.
+    pub fn operation_numbers(&self) -> Vec<usize> {
+        let begins = (0..self.segments.len()).map(|index| usize::from(!self.is_continued(index)));
+        begins
+            .scan(0, |begun, begins| {
+                *begun += begins;
+                Some(*begun - 1)
+            })
+            .collect()
     }
 
     /// Whether a segment continues the one before.

@@ -306,10 +306,10 @@ fn what_the_sensor_is_off_by_does_not_hide_what_the_battery_is() {
     for (alignment_s, soc_shift) in [(0.02, 0.0), (0.0, -0.03), (0.05, 0.01)] {
         let found = Nuisance {
             alignment_s,
-            soc_shift,
+            soc_shift: vec![soc_shift],
             ..Nuisance::default()
         };
-        shift.take(found);
+        shift.take(&found);
     }
     assert_eq!((shift.alignment_s, shift.soc), (0.02, -0.03));
 }

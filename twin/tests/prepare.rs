@@ -424,7 +424,8 @@ fn the_state_of_charge_goes_on_over_a_gap() {
         "{:?}",
         base.initial_soc
     );
-    assert!(base.initial_soc_sigma > 0.005);
+    assert_eq!(base.initial_soc_sigma.len(), 1);
+    assert!(base.initial_soc_sigma[0] > 0.005);
     assert!(
         remarks.iter().any(|remark| remark.contains("initial_soc")),
         "{remarks:?}"

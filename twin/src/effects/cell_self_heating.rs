@@ -55,7 +55,7 @@ impl Effect for CellSelfHeating {
             return;
         };
         let (rth_k_per_w, tau_s) = (values[0], values[1]);
-        let ohms = battery.base.resistance_ohm / battery.base.cells;
+        let ohms = battery.resistance * battery.base.resistance_ohm / battery.base.cells;
         // Where the surroundings' temperature acts on nothing, only the cell's own heat does.
         let (b_k, stated) = match battery.arrhenius_k {
             Some(b_k) => (b_k, true),

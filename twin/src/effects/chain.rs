@@ -5,10 +5,10 @@ use super::{Effect, Stage};
 use crate::problem::{Base, Problem, View};
 
 /// What the base may differ by without being physics that was left out: within what the model file says it does not know.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Nuisance {
-    /// Added to the initial state of charge, 0 … 1.
-    pub soc_shift: f64,
+    /// Added to the state of charge at the start of each operation, 0 … 1; nothing where there is no value.
+    pub soc_shift: Vec<f64>,
     /// Relative change of the ohmic resistance.
     pub resistance: f64,
     /// Time by which readings are late, within half a step of the sampling: how samples stand for what is between them.
@@ -99,7 +99,7 @@ impl<'a> Chain<'a> {
                 alignment_s: -base.alignment_s,
                 ..Nuisance::default()
             };
-            let plain = chain.run(&[], unaligned);
+            let plain = chain.run(&[], &unaligned);
             chain.beside = base
                 .reading
                 .iter()
@@ -111,7 +111,7 @@ impl<'a> Chain<'a> {
     }
 
     /// What the simulation says at each observed row; NaN where the drive does not reach.
-    pub fn run(&self, members: &Members<'_>, nuisance: Nuisance) -> Vec<f64> {
+    pub fn run(&self, members: &Members<'_>, nuisance: &Nuisance) -> Vec<f64> {
         self.run_with_noise(members, nuisance, None)
     }
 
@@ -120,7 +120,7 @@ impl<'a> Chain<'a> {
     pub fn run_with_noise(
         &self,
         members: &Members<'_>,
-        nuisance: Nuisance,
+        nuisance: &Nuisance,
         mut noise: Option<&mut dyn Iterator<Item = f64>>,
     ) -> Vec<f64> {
         let links = self.links(members);
@@ -141,7 +141,7 @@ impl<'a> Chain<'a> {
     }
 
     /// The simulation up to a member, to be gone on with for many values of it.
-    pub fn begin(&self, members: &Members<'_>, nuisance: Nuisance, index: usize) -> Begun<'a> {
+    pub fn begin(&self, members: &Members<'_>, nuisance: &Nuisance, index: usize) -> Begun<'a> {
         let links = self.links(members);
         let mut begun = self.begun();
         self.advance(
@@ -162,7 +162,7 @@ impl<'a> Chain<'a> {
     }
 
     /// Runs links up to one.
-    fn advance(&self, begun: &mut Begun<'a>, links: &[Link<'_>], to: usize, nuisance: Nuisance) {
+    fn advance(&self, begun: &mut Begun<'a>, links: &[Link<'_>], to: usize, nuisance: &Nuisance) {
         for link in &links[begun.done..to] {
             self.apply(&mut begun.scene, *link, nuisance);
         }
@@ -171,7 +171,7 @@ impl<'a> Chain<'a> {
 
     /// The rest of it: what the simulation says at each observed row. The members are those that it was begun with; the
     /// values may differ of the one up to which it was begun.
-    pub fn go_on(&self, begun: &Begun<'a>, members: &Members<'_>, nuisance: Nuisance) -> Vec<f64> {
+    pub fn go_on(&self, begun: &Begun<'a>, members: &Members<'_>, nuisance: &Nuisance) -> Vec<f64> {
         let links = self.links(members);
         let mut begun = begun.clone();
         self.advance(&mut begun, &links, links.len(), nuisance);
@@ -182,7 +182,7 @@ impl<'a> Chain<'a> {
     pub fn vary(
         &self,
         members: &Members<'_>,
-        nuisance: Nuisance,
+        nuisance: &Nuisance,
         variations: &[Variation<'_>],
         take: impl Fn(Vec<f64>) -> Vec<f64>,
     ) -> Vec<Vec<f64>> {
@@ -198,7 +198,7 @@ impl<'a> Chain<'a> {
         for k in order {
             self.advance(&mut begun, &links, first[k], nuisance);
             let (_, members, nuisance) = &variations[k];
-            outputs[k] = take(self.go_on(&begun, members, *nuisance));
+            outputs[k] = take(self.go_on(&begun, members, nuisance));
         }
         outputs
     }
@@ -251,7 +251,7 @@ impl<'a> Chain<'a> {
         order
     }
 
-    fn apply(&self, scene: &mut Scene<'_>, link: Link<'_>, nuisance: Nuisance) {
+    fn apply(&self, scene: &mut Scene<'_>, link: Link<'_>, nuisance: &Nuisance) {
         match link {
             Link::Effect(effect, values, _) => effect.apply(values, scene),
             Link::Window => {
@@ -274,7 +274,7 @@ impl<'a> Chain<'a> {
                 .for_each(|(value, beside)| *value += beside),
             Link::Count => {
                 if let Some(battery) = &mut scene.battery {
-                    battery.soc_shift = nuisance.soc_shift;
+                    battery.soc_shift.clone_from(&nuisance.soc_shift);
                     battery.count(scene.drive, &scene.signal);
                     if self.problem.view != View::StateOfCharge {
                         battery.open_circuit();
@@ -288,7 +288,7 @@ impl<'a> Chain<'a> {
             }
             Link::Terminals => {
                 if let Some(battery) = &mut scene.battery {
-                    battery.resistance = 1.0 + nuisance.resistance;
+                    battery.resistance *= 1.0 + nuisance.resistance;
                     if self.problem.view == View::StateOfCharge {
                         scene.signal = battery.soc.iter().map(|soc| 100.0 * soc).collect();
                     } else {

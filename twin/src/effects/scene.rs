@@ -86,9 +86,9 @@ pub struct Battery<'a> {
     pub capacity_ah: f64,
     /// Share of the charge put in that comes back.
     pub efficiency: f64,
-    /// Added to the initial state of charge, 0 … 1.
-    pub soc_shift: f64,
-    /// Factor of the ohmic resistance by design.
+    /// Added to the state of charge at the start of each operation, 0 … 1; nothing where there is no value.
+    pub soc_shift: Vec<f64>,
+    /// Factor of the ohmic resistance by design, at 25 °C.
     pub resistance: f64,
     /// State of charge, 0 … 1; filled between the stages of charge and temperature.
     pub soc: Series,
@@ -740,7 +740,7 @@ impl<'a> Battery<'a> {
             } else {
                 1.0
             },
-            soc_shift: 0.0,
+            soc_shift: Vec::new(),
             resistance: 1.0,
             soc: Series::default(),
             open_circuit_v: Series::default(),
@@ -756,6 +756,7 @@ impl<'a> Battery<'a> {
         let mut soc = vec![0.0; drive.len()];
         let per_as = 1.0 / (3600.0 * self.capacity_ah);
         let of_segment = |values: &[f64], index: usize| values.get(index).copied();
+        let operations = drive.operation_numbers();
         let mut end = 1.0;
         for (index, rows) in drive
             .segments
@@ -769,7 +770,8 @@ impl<'a> Battery<'a> {
                 let ends = [current_a[rows.start - 1], current_a[rows.start]];
                 end - gap_ah(ends, gap_s, excess_ah, self.efficiency) / self.capacity_ah
             } else {
-                of_segment(&self.base.initial_soc, index).unwrap_or(1.0) + self.soc_shift
+                of_segment(&self.base.initial_soc, index).unwrap_or(1.0)
+                    + of_segment(&self.soc_shift, operations[index]).unwrap_or_default()
             };
             soc[rows.start] = first;
             let mut last = first;

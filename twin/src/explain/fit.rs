@@ -7,6 +7,7 @@ use std::sync::{Arc, OnceLock};
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
+use super::starts;
 use super::workbench::{Model, Workbench};
 use crate::effects::Search;
 use crate::effects::chain::{Begun, Change};
@@ -43,7 +44,7 @@ const WORTH: f64 = 0.1;
 
 /// What the model file says of the base is off by this many of its own standard uncertainties at most: beyond them it is no
 /// uncertainty but physics that was left out, and has a name.
-pub(super) const BASE_OFF: f64 = 4.0;
+pub const BASE_OFF: f64 = 4.0;
 
 /// Whether a value of the base stands at that end, by how many of its standard uncertainties it is off.
 pub(super) fn at_base_end(deviations: f64) -> bool {
@@ -113,7 +114,8 @@ impl Fit {
 enum Coordinate {
     /// Member, parameter, and whether its logarithm is the coordinate.
     Value(usize, usize, bool),
-    SocShift,
+    /// Index of the start, among those of the bench.
+    SocShift(usize),
     Resistance,
     Alignment,
 }
@@ -123,7 +125,7 @@ impl Coordinate {
     fn change(self) -> Change {
         match self {
             Self::Value(member, _, _) => Change::Member(member),
-            Self::SocShift => Change::SocShift,
+            Self::SocShift(_) => Change::SocShift,
             Self::Resistance => Change::Resistance,
             Self::Alignment => Change::Alignment,
         }
@@ -222,7 +224,13 @@ impl Slope {
     }
 
     /// Carries the slope along a step (Broyden's update): cheaper than a new one, and nearly as good for small steps.
-    fn learn(&mut self, step: &[f64], before: &[f64], after: &[f64], model: &Model) {
+    fn learn(
+        &mut self,
+        bench: &Workbench<'_>,
+        step: &[f64],
+        [before, after]: [&[f64]; 2],
+        model: &Model,
+    ) {
         let scaled: Vec<f64> = self
             .columns
             .iter()
@@ -252,10 +260,38 @@ impl Slope {
         }
         for (coordinate, at) in self.coordinates.iter().zip(&mut self.at) {
             *at = match coordinate {
-                Coordinate::SocShift => model.nuisance.soc_shift,
+                Coordinate::SocShift(start) => bench.starts[*start].at(&model.nuisance),
                 Coordinate::Resistance => model.nuisance.resistance,
                 _ => *at,
             };
+        }
+    }
+
+    /// Leaves coordinates where they are: values beyond which nothing means anything (a knee at full charge) that would go there
+    /// (`at_ends` has the model, and which way each would go), and of the starts, by index and coordinate, those of which the readings in use do not tell: how an
+    /// operation began is no physics that another one could tell.
+    fn keep(
+        &self,
+        at_ends: Option<(&Model, &DVector<f64>)>,
+        (normal, right): (&mut DMatrix<f64>, &mut DVector<f64>),
+        untold: impl Fn(usize, usize) -> bool,
+    ) {
+        for (k, coordinate) in self.coordinates.iter().enumerate() {
+            let stays = match *coordinate {
+                Coordinate::Value(m, p, _) => at_ends.is_some_and(|(model, outward)| {
+                    let member = &model.members[m];
+                    let (low, high) = member.effect.card().parameters[p].limits;
+                    let value = member.values[p];
+                    (value <= low && outward[k] < 0.0) || (value >= high && outward[k] > 0.0)
+                }),
+                Coordinate::SocShift(start) => untold(start, k),
+                _ => false,
+            };
+            if stays {
+                normal.row_mut(k).fill(0.0);
+                normal.column_mut(k).fill(0.0);
+                right[k] = 0.0;
+            }
         }
     }
 
@@ -268,10 +304,10 @@ impl Slope {
     }
 }
 
-/// Standard uncertainties of the base: of the initial state of charge, and of the resistance as a share of it.
-fn base_sigmas(bench: &Workbench<'_>) -> Option<(f64, f64)> {
+/// Standard uncertainty of the resistance, as a share of it.
+fn resistance_sigma(bench: &Workbench<'_>) -> Option<f64> {
     match &bench.problem.base {
-        Base::Battery(base) => Some((base.initial_soc_sigma, base.resistance_sigma)),
+        Base::Battery(base) => Some(base.resistance_sigma),
         Base::Sensor(_) => None,
     }
 }
@@ -299,14 +335,9 @@ fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta
             };
             *value = value.clamp(low.min(high), high.max(low));
         }
-        Coordinate::SocShift => {
-            let most = base_sigmas(bench)
-                .map_or(1.0, |(soc, _)| BASE_OFF * soc)
-                .min(1.0);
-            model.nuisance.soc_shift = (model.nuisance.soc_shift + delta).clamp(-most, most);
-        }
+        Coordinate::SocShift(start) => bench.starts[start].shift(&mut model.nuisance, delta),
         Coordinate::Resistance => {
-            let most = base_sigmas(bench).map_or(5.0, |(_, resistance)| BASE_OFF * resistance);
+            let most = resistance_sigma(bench).map_or(5.0, |sigma| BASE_OFF * sigma);
             let resistance = model.nuisance.resistance + delta;
             model.nuisance.resistance = resistance.clamp((-most).max(-0.9), most);
         }
@@ -352,15 +383,16 @@ fn coordinates(bench: &Workbench<'_>, model: &Model) -> Vec<(Coordinate, f64, f6
     }
     if let Base::Battery(base) = &bench.problem.base {
         let inverse = |sigma: f64| 1.0 / (sigma * sigma);
-        if base.initial_soc_sigma > 0.0 {
+        for (index, start) in bench.starts.iter().enumerate() {
             all.push((
-                Coordinate::SocShift,
-                1e-5,
-                inverse(base.initial_soc_sigma),
-                model.nuisance.soc_shift,
+                Coordinate::SocShift(index),
+                starts::SMALL,
+                inverse(start.sigma),
+                start.at(&model.nuisance),
             ));
         }
-        if base.resistance_sigma > 0.0 && bench.problem.view == crate::problem::View::Voltage {
+        let is_voltage = bench.problem.view == crate::problem::View::Voltage;
+        if base.resistance_sigma > 0.0 && is_voltage && !model.says_resistance() {
             all.push((
                 Coordinate::Resistance,
                 1e-4,
@@ -457,6 +489,33 @@ fn unrounded(bench: &Workbench<'_>, model: &Model) -> Option<(Model, Vec<f64>)> 
     })
 }
 
+/// Coordinates that are moved in one run: each by itself but for the starts, of which no operation knows another's.
+fn runs<'k>(
+    coordinates: &[(Coordinate, f64, f64, f64)],
+    some: &'k [usize],
+) -> impl Iterator<Item = &'k [usize]> {
+    let is_start = |k: &usize| matches!(coordinates[*k].0, Coordinate::SocShift(_));
+    some.chunk_by(move |a, b| is_start(a) && is_start(b))
+}
+
+/// Of a run in which some coordinates were moved, what each of them does.
+fn apart(
+    bench: &Workbench<'_>,
+    coordinates: &[(Coordinate, f64, f64, f64)],
+    together: &[usize],
+    varied: Vec<f64>,
+    predicted: &[f64],
+) -> Vec<(usize, Vec<f64>)> {
+    let own = |k: &usize| match coordinates[*k].0 {
+        Coordinate::SocShift(start) => (*k, bench.starts[start].own(&varied, predicted)),
+        _ => (*k, varied.clone()),
+    };
+    match together {
+        [only] => vec![(*only, varied)],
+        several => several.iter().map(own).collect(),
+    }
+}
+
 /// The slope at a model.
 fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
     let residual = bench.residual(predicted);
@@ -482,16 +541,25 @@ fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
         if missing.is_empty() {
             break;
         }
-        let moved: Vec<(Change, Model)> = missing
-            .iter()
-            .map(|k| {
-                let (coordinate, step, _, _) = coordinates[*k];
+        let moved: Vec<(Change, Model)> = runs(&coordinates, &missing)
+            .map(|together| {
                 let mut moved = model.clone();
-                shift(bench, &mut moved, coordinate, sign * step);
-                (coordinate.change(), moved)
+                for k in together {
+                    shift(
+                        bench,
+                        &mut moved,
+                        coordinates[*k].0,
+                        sign * coordinates[*k].1,
+                    );
+                }
+                (coordinates[together[0]].0.change(), moved)
             })
             .collect();
-        for (k, mut column) in missing.into_iter().zip(bench.vary(model, &moved)) {
+        let varied = bench.vary(model, &moved);
+        let parts = runs(&coordinates, &missing)
+            .zip(varied)
+            .flat_map(|(together, varied)| apart(bench, &coordinates, together, varied, predicted));
+        for (k, mut column) in parts {
             let per_step = sign / coordinates[k].1;
             let mut any = false;
             for (there, here) in column.iter_mut().zip(predicted) {
@@ -515,6 +583,18 @@ fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> Slope {
     slope
 }
 
+/// The rows from the first to the last that is not nothing, in whole lanes: sums over them are the same to the last digit.
+fn reach(column: &[f64], start: usize) -> std::ops::Range<usize> {
+    let is_some = |value: &f64| *value != 0.0;
+    let first = column.iter().position(is_some).unwrap_or(column.len());
+    let last = column
+        .iter()
+        .rposition(is_some)
+        .map_or(first, |last| last + 1);
+    let last = last.next_multiple_of(LANES).min(column.len());
+    start + first - first % LANES..start + last
+}
+
 /// Normal equations over some rows: JᵀWJ and JᵀWr.
 pub fn normal(
     columns: &[Vec<f64>],
@@ -526,16 +606,27 @@ pub fn normal(
     let mut matrix = DMatrix::zeros(size, size);
     let mut right = DVector::zeros(size);
     let mut weighted = vec![0.0; rows.len()];
+    // Where an operation begins tells in its own rows alone.
+    let reaches: Vec<std::ops::Range<usize>> = columns
+        .iter()
+        .map(|column| reach(&column[rows.clone()], rows.start))
+        .collect();
     for a in 0..size {
-        let column = &columns[a][rows.clone()];
-        for ((out, value), weight) in weighted.iter_mut().zip(column).zip(&weights[rows.clone()]) {
+        let own = reaches[a].clone();
+        let weighted = &mut weighted[..own.len()];
+        let pairs = columns[a][own.clone()].iter().zip(&weights[own.clone()]);
+        for (out, (value, weight)) in weighted.iter_mut().zip(pairs) {
             *out = value * weight;
         }
-        right[a] = dot(&weighted, &residual[rows.clone()]);
+        right[a] = dot(weighted, &residual[own.clone()]);
         for b in 0..=a {
-            let sum = dot(&weighted, &columns[b][rows.clone()]);
-            matrix[(a, b)] = sum;
-            matrix[(b, a)] = sum;
+            let (from, to) = (own.start.max(reaches[b].start), own.end.min(reaches[b].end));
+            if from < to {
+                let here = &weighted[from - own.start..to - own.start];
+                let sum = dot(here, &columns[b][from..to]);
+                matrix[(a, b)] = sum;
+                matrix[(b, a)] = sum;
+            }
         }
     }
     (matrix, right)
@@ -732,6 +823,9 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
     if !bench.aligns(&model) {
         model.nuisance.alignment_s = 0.0;
     }
+    if model.says_resistance() {
+        model.nuisance.resistance = 0.0;
+    }
     let predicted = bench.run(&model);
     let mut here = Point::of(bench, model, predicted);
     let mut sigma = spread(&here.residual);
@@ -838,6 +932,10 @@ fn descend(aim: Aim<'_, '_>, here: &mut Point, known: Option<Slope>) -> Option<S
         let (mut matrix, mut right) =
             normal(&slope.columns, &weights, &here.residual, 0..bench.len());
         slope.penalty(&mut matrix, &mut right);
+        if let Some(used) = used {
+            let untold = |start: usize, _| !bench.starts[start].told_by(used);
+            slope.keep(None, (&mut matrix, &mut right), untold);
+        }
         let mut gain = 0.0;
         for _ in 0..6 {
             let step = solve(&matrix, &right, damping);
@@ -847,12 +945,8 @@ fn descend(aim: Aim<'_, '_>, here: &mut Point, known: Option<Slope>) -> Option<S
             let less = aim.cost(&there.model, &there.residual);
             if less < cost {
                 gain = (cost - less) / cost.max(1e-300);
-                slope.learn(
-                    step.as_slice(),
-                    &here.predicted,
-                    &there.predicted,
-                    &there.model,
-                );
+                let predicted = [here.predicted.as_slice(), &there.predicted];
+                slope.learn(bench, step.as_slice(), predicted, &there.model);
                 (*here, cost) = (there, less);
                 damping = (damping * 0.2).max(1e-9);
                 break;
@@ -1071,11 +1165,20 @@ pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<Vec<f64>> {
         right += part;
     }
     let weights = &blocked.weights;
+    let slope = &blocked.slope;
+    // A start that only these rows tell.
+    let untold = |here: &DMatrix<f64>, k: usize| {
+        let all = total[(k, k)] - slope.prior[k];
+        bench.starts.len() > 1 && starts::within_block(here[(k, k)], all)
+    };
     // Loss of rows with the values that are left without them.
-    let without = |rows: Range<usize>, matrix: &DMatrix<f64>, part: &DVector<f64>| -> Vec<f64> {
-        let step = solve(&(&total - matrix), &(&right - part), 1e-9);
+    let without = |rows: Range<usize>, here: &DMatrix<f64>, part: &DVector<f64>| -> Vec<f64> {
+        let (mut matrix, mut others) = (&total - here, &right - part);
+        let at_ends = Some((&fit.model, &right));
+        slope.keep(at_ends, (&mut matrix, &mut others), |_, k| untold(here, k));
+        let step = solve(&matrix, &others, 1e-9);
         rows.map(|row| {
-            let columns = blocked.slope.columns.iter().zip(step.iter());
+            let columns = slope.columns.iter().zip(step.iter());
             let moved: f64 = columns.map(|(column, step)| column[row] * step).sum();
             huber((fit.residual[row] - moved) / sigma)
         })
@@ -1087,13 +1190,14 @@ pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<Vec<f64>> {
         .iter()
         .zip(blocked.matrices.iter().zip(&blocked.rights))
         .map(|(rows, (matrix, part))| {
-            if solver.most_of(matrix) < ALONE {
+            let (mut told, mut ignored) = (matrix.clone(), part.clone());
+            slope.keep(None, (&mut told, &mut ignored), |_, k| untold(matrix, k));
+            if solver.most_of(&told) < ALONE {
                 return without(rows.clone(), matrix, part);
             }
-            let columns = &blocked.slope.columns;
-            let parts = solver.parts(columns, weights, rows.clone());
+            let parts = solver.parts(&slope.columns, weights, rows.clone());
             let losses = parts.into_iter().flat_map(|rows| {
-                let (matrix, part) = normal(columns, weights, &fit.residual, rows.clone());
+                let (matrix, part) = normal(&slope.columns, weights, &fit.residual, rows.clone());
                 without(rows, &matrix, &part)
             });
             losses.collect()

@@ -1199,6 +1199,15 @@ pub fn beaten(bench: &Workbench<'_>, other: &Fit, chosen: &Fit) -> bool {
     let sigma = chosen.sigma.min(other.sigma);
     let (theirs, _) = losses(bench, other, sigma);
     let (ours, _) = losses(bench, chosen, sigma);
+    // Noise with a memory tells two models apart by no more than what it does along their difference, however many the rows.
+    let apart = change(&other.predicted, &chosen.predicted);
+    let stated = bench.carried(0, &apart).unwrap_or(0.0) + bench.rounded(0, &apart);
+    worse(&theirs, &ours, stated.sqrt() / (sigma * sigma))
+}
+
+/// Whether losses, row by row, are higher than others by more than chance, stretch against stretch; `stated` is the standard
+/// deviation of their sums' difference that is known besides.
+pub fn worse(theirs: &[f64], ours: &[f64], stated: f64) -> bool {
     let rows = (ours.len() / STRETCHES).max(1);
     let differences: Vec<f64> = theirs
         .chunks(rows)
@@ -1209,11 +1218,7 @@ pub fn beaten(bench: &Workbench<'_>, other: &Fit, chosen: &Fit) -> bool {
     let mean = differences.iter().sum::<f64>() / count;
     let variance =
         differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
-    // Noise with a memory tells two models apart by no more than what it does along their difference, however many the rows.
-    let apart = change(&other.predicted, &chosen.predicted);
-    let stated = bench.carried(0, &apart).unwrap_or(0.0) + bench.rounded(0, &apart);
-    let stated = stated.sqrt() / (sigma * sigma * count);
-    mean > BEATEN * (variance / count).sqrt().max(stated)
+    mean > BEATEN * (variance / count).sqrt().max(stated / count)
 }
 
 /// Whether a model owes what it gains to the alignment of samples that its effect sets free, and not to the effect.

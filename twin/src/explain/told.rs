@@ -180,11 +180,11 @@ pub(super) fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> 
     }
 }
 
-/// The verdict in one sentence; `vetoed` is what was taken back for a file that was never fitted.
+/// The verdict in one sentence; `elsewhere` is what another start would do, and `vetoed` is what was taken back for a file that was never fitted.
 pub(super) fn sentence(
     bench: &Workbench<'_>,
     selection: &Selection,
-    (verdict, doubted): (Verdict, bool),
+    (verdict, doubted, elsewhere): (Verdict, bool, Option<&str>),
     left: Explainable,
     (vetoed, report): (&[&str], &Report),
 ) -> String {
@@ -211,14 +211,14 @@ pub(super) fn sentence(
     });
     match verdict {
         Verdict::NoMismatch
-            if let Some(found) = base_differs(selection.fit.model.nuisance)
+            if let Some(found) = base_differs(&selection.fit.model.nuisance)
                 && report.signals.last().is_some_and(|signal| {
                     signal.rmse_before > NOT_AS_STATED * signal.rmse_after
                 }) =>
         {
             format!(
                 "{name}: no physics is left out, but {found} than stated, {} what the model file leaves open ({figures}).",
-                if at_limit(selection.fit.model.nuisance, &bench.problem.base) {
+                if at_limit(&selection.fit.model.nuisance, &bench.problem.base) {
                     "at the end of"
                 } else {
                     "within"
@@ -241,6 +241,10 @@ pub(super) fn sentence(
                 "what remains is louder than the stated noise".to_owned()
             }
         ),
+        Verdict::Ambiguous if let Some(elsewhere) = elsewhere => format!(
+            "{name}: explained by {} ({figures}), but without any physics as well {elsewhere}: initial_soc may be off.",
+            ids.join(" and ")
+        ),
         Verdict::Ambiguous if doubted => format!(
             "{name}: explained best by {} ({figures}), but not certainly: another physics of much the same shape may be behind it.",
             ids.join(" and ")
@@ -253,6 +257,9 @@ pub(super) fn sentence(
             "{name}: there is a mismatch; here {} would account for it, but a file that was never fitted gets worse with it ({figures}).",
             vetoed.join(" and ")
         ),
+        Verdict::Unknown if let Some(elsewhere) = elsewhere => format!(
+            "{name}: there is a mismatch, and no effect of the library accounts for it ({figures}); {elsewhere}: initial_soc may be off."
+        ),
         Verdict::Unknown => format!(
             "{name}: there is a mismatch, and no effect of the library accounts for it ({figures})."
         ),
@@ -261,7 +268,7 @@ pub(super) fn sentence(
 
 /// What was found of a battery within what the model file leaves open: it is no physics that was left out, and part of every error
 /// after it.
-pub(super) fn base_found(name: &str, nuisance: Nuisance, base: &Base) -> Option<String> {
+pub(super) fn base_found(name: &str, nuisance: &Nuisance, base: &Base) -> Option<String> {
     base_differs(nuisance).map(|found| {
         if at_limit(nuisance, base) {
             format!(
@@ -275,27 +282,38 @@ pub(super) fn base_found(name: &str, nuisance: Nuisance, base: &Base) -> Option<
 }
 
 /// Whether what a battery is found to be off by stands at the end of what the model file allows.
-fn at_limit(nuisance: Nuisance, base: &Base) -> bool {
+fn at_limit(nuisance: &Nuisance, base: &Base) -> bool {
     let Base::Battery(base) = base else {
         return false;
     };
     let ends = |found: f64, sigma: f64| sigma > 0.0 && at_base_end(found / sigma);
-    ends(nuisance.soc_shift, base.initial_soc_sigma)
+    let mut starts = nuisance.soc_shift.iter().zip(&base.initial_soc_sigma);
+    starts.any(|(shift, sigma)| ends(*shift, *sigma))
         || ends(nuisance.resistance, base.resistance_sigma)
 }
 
 /// By what the battery as designed differs, if by more than [`TOLD_PERCENT`].
-fn base_differs(nuisance: Nuisance) -> Option<String> {
+fn base_differs(nuisance: &Nuisance) -> Option<String> {
     let by = |share: f64, what: &str, unit: &str| {
         let percent = 100.0 * share;
         let way = if percent > 0.0 { "higher" } else { "lower" };
         (percent.abs() >= TOLD_PERCENT)
             .then(|| format!("{what} {} {unit} {way}", short(percent.abs())))
     };
-    let start = "the state of charge at the start";
+    let shifts = nuisance.soc_shift.iter().copied().enumerate();
+    let (operation, shift) = shifts
+        .max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))
+        .unwrap_or_default();
+    let start = match nuisance.soc_shift.len() {
+        0 | 1 => "the state of charge at the start".to_owned(),
+        count => format!(
+            "the state of charge at the start of operation {}, the most of {count},",
+            operation + 1
+        ),
+    };
     let found: Vec<String> = [
         by(nuisance.resistance, "the ohmic resistance", "%"),
-        by(nuisance.soc_shift, start, "points of per cent"),
+        by(shift, &start, "points of per cent"),
     ]
     .into_iter()
     .flatten()
@@ -349,7 +367,7 @@ pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
             .iter()
             .map(|member| (member.id().to_owned(), values(member)))
             .collect(),
-        nuisance: fit.model.nuisance,
+        nuisance: fit.model.nuisance.clone(),
         smooth_reference: matches!(&problem.base, Base::Sensor(base) if base.smooth_reference),
     }
 }
@@ -374,15 +392,15 @@ mod tests {
         let found = |resistance, soc_shift| {
             let nuisance = Nuisance {
                 resistance,
-                soc_shift,
+                soc_shift: vec![soc_shift],
                 ..Nuisance::default()
             };
             let base = Base::Battery(BatteryBase {
-                initial_soc_sigma: 0.01,
+                initial_soc_sigma: vec![0.01],
                 resistance_sigma: 0.1,
                 ..BatteryBase::default()
             });
-            base_found("v_cell_v", nuisance, &base)
+            base_found("v_cell_v", &nuisance, &base)
         };
         assert_eq!(found(4e-4, -4e-4), None);
         let said = found(0.273, -0.0071).unwrap();

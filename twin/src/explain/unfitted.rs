@@ -3,10 +3,11 @@
 use std::path::Path;
 
 use super::fit;
+use super::starts::begun;
 use super::told::short;
 use super::trust::{WAVERS, roughness};
 use super::workbench::{Model, Workbench};
-use super::{Holdout, Nuisance, Selection, rms, select};
+use super::{Holdout, Selection, rms, select};
 use crate::report::data::HoldoutReport;
 
 /// An effect that makes the error in another file larger by this factor is not that file's physics.
@@ -22,6 +23,8 @@ const TOLD_NOISE: f64 = 3.0;
 pub(super) struct Unfitted<'a> {
     file: &'a Path,
     bench: Workbench<'a>,
+    /// What the simulation as designed leaves, begun as this file does.
+    mismatch: Vec<f64>,
 }
 
 impl<'a> Unfitted<'a> {
@@ -32,9 +35,13 @@ impl<'a> Unfitted<'a> {
             .flat_map(|holdout| holdout.problems.iter().map(move |other| (holdout, other)));
         problems
             .filter(|(_, other)| other.name == signal)
-            .map(|(holdout, other)| Self {
-                file: &holdout.file,
-                bench: Workbench::new(other, &[]),
+            .map(|(holdout, other)| {
+                let bench = Workbench::new(other, &[]);
+                Self {
+                    file: &holdout.file,
+                    mismatch: begun(&bench, Model::default()).1,
+                    bench,
+                }
             })
             .collect()
     }
@@ -66,13 +73,13 @@ impl<'a> Unfitted<'a> {
 
     /// Error with a model.
     fn rmse(&self, model: &Model) -> f64 {
-        let predicted = self.bench.run(&self.there(model));
-        rms(self.bench.residual(&predicted).into_iter())
+        rms(self.left_by(model).into_iter())
     }
 
-    /// The model as it is taken to this file: how a file starts, and where in a turn, is its own; the physics is not.
-    fn there(&self, model: &Model) -> Model {
-        let mut model = elsewhere(model);
+    /// What a model leaves as it is taken to this file: how a file starts, and where in a turn, is its own; the physics is not.
+    fn left_by(&self, model: &Model) -> Vec<f64> {
+        let (mut model, residual) = begun(&self.bench, model.clone());
+        let mut turned = false;
         let error = |model: &Model| rms(self.bench.residual(&self.bench.run(model)).into_iter());
         for m in 0..model.members.len() {
             let member = &model.members[m];
@@ -96,20 +103,25 @@ impl<'a> Unfitted<'a> {
                 }
             }
             model.members[m].values[p] = best.1;
+            turned = true;
         }
-        model
+        if turned {
+            self.bench.residual(&self.bench.run(&model))
+        } else {
+            residual
+        }
     }
 
     /// Error as designed.
     fn rmse_before(&self) -> f64 {
-        rms(self.bench.residual(&self.bench.plain).into_iter())
+        rms(self.mismatch.iter().copied())
     }
 
     /// How many times the change that a model makes here is in this file's mismatch, and the standard error of that: regression of
     /// the one on the other, blocks as clusters (Liang and Zeger 1986). 1 is what a true effect has; `None` without a change.
     fn times_there(&self, model: &Model) -> Option<(f64, f64)> {
-        let mismatch = self.bench.residual(&self.bench.plain);
-        let left = self.bench.residual(&self.bench.run(&self.there(model)));
+        let mismatch = &self.mismatch;
+        let left = self.left_by(model);
         let change: Vec<f64> = mismatch.iter().zip(&left).map(|(a, b)| a - b).collect();
         let blocks = &self.bench.blocks;
         let energy: f64 = blocks
@@ -135,17 +147,6 @@ impl<'a> Unfitted<'a> {
             .sum();
         let count = blocks.len() as f64;
         Some((times, (scatter * count / (count - 1.0)).sqrt() / energy))
-    }
-}
-
-/// The model as it is taken to another file: how a file starts is its own, the physics is not.
-fn elsewhere(model: &Model) -> Model {
-    Model {
-        nuisance: Nuisance {
-            soc_shift: 0.0,
-            ..model.nuisance
-        },
-        ..model.clone()
     }
 }
 

@@ -9,6 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use rand_distr::{Distribution as _, StandardNormal};
 
+use super::starts::Start;
 use super::whiten::Whitening;
 use crate::effects::chain::{Begun, Chain, Change, Nuisance, Variation};
 use crate::effects::scene::{ROUNDS, Scale};
@@ -69,6 +70,13 @@ impl Model {
         self.members.iter().any(|member| member.id() == id)
     }
 
+    /// Whether one of its effects says what the ohmic resistance is.
+    pub fn says_resistance(&self) -> bool {
+        self.members
+            .iter()
+            .any(|member| member.effect.says_resistance())
+    }
+
     /// With one more effect.
     pub fn with(&self, member: Member) -> Self {
         let mut model = self.clone();
@@ -110,6 +118,8 @@ pub struct Workbench<'a> {
     pub reference: Vec<f64>,
     /// Ranges of those rows that are held out in turn, guards left out.
     pub blocks: Vec<Range<usize>>,
+    /// At which states of charge operations begin, where that is not known exactly.
+    pub starts: Vec<Start>,
     /// Effects that may be named.
     pub library: Vec<&'static dyn Effect>,
     /// Energy by which the equations of the effects that the model file has may be off.
@@ -125,7 +135,7 @@ pub struct Workbench<'a> {
 /// A model to the last digit.
 type Key = (
     Vec<(&'static str, Vec<u64>)>,
-    [u64; 3],
+    Vec<u64>,
     bool,
     Option<(usize, usize)>,
 );
@@ -139,12 +149,13 @@ fn key(model: &Model) -> Key {
             .iter()
             .map(|member| (member.id(), bits(&member.values)))
             .collect(),
-        [
-            nuisance.soc_shift,
-            nuisance.resistance,
-            nuisance.alignment_s,
-        ]
-        .map(f64::to_bits),
+        bits(
+            &[
+                nuisance.soc_shift.as_slice(),
+                &[nuisance.resistance, nuisance.alignment_s],
+            ]
+            .concat(),
+        ),
         model.unaligned,
         model.held,
     )
@@ -154,7 +165,7 @@ impl<'a> Workbench<'a> {
     /// For a problem; `without` takes effects out of the library.
     pub fn new(problem: &'a Problem, without: &[String]) -> Self {
         let chain = Chain::new(problem);
-        let all = chain.run(&[], Nuisance::default());
+        let all = chain.run(&[], &Nuisance::default());
         let observed = &problem.observed;
         let valid = || {
             (0..observed.t_s.len()).filter(|&row| {
@@ -171,7 +182,7 @@ impl<'a> Workbench<'a> {
                 let share = find_with(id, values.len()).map_or(0.0, |effect| effect.idealised());
                 let mut without = problem.clone();
                 without.modelled.remove(index);
-                let without = Chain::new(&without).run(&[], Nuisance::default());
+                let without = Chain::new(&without).run(&[], &Nuisance::default());
                 let energy: f64 = rows
                     .iter()
                     .map(|&row| (all[row] - without[row]).powi(2))
@@ -213,6 +224,7 @@ impl<'a> Workbench<'a> {
             problem,
             chain,
             scale,
+            starts: Start::all(problem, &rows),
             marks,
             modelled,
             rows,
@@ -237,6 +249,7 @@ impl<'a> Workbench<'a> {
             problem,
             chain: Chain::new(problem),
             scale: self.scale,
+            starts: self.starts.clone(),
             rows: self.rows.clone(),
             t_s: self.t_s.clone(),
             y: self.y.clone(),
@@ -356,7 +369,7 @@ impl<'a> Workbench<'a> {
 
     /// The simulation at every observed row.
     pub fn everywhere(&self, model: &Model) -> Vec<f64> {
-        self.chain.run(&members(model), model.nuisance)
+        self.chain.run(&members(model), &model.nuisance)
     }
 
     /// Squared change, summed over the rows that count, that noise of a standard deviation ahead of the end of the chain makes to
@@ -368,7 +381,7 @@ impl<'a> Workbench<'a> {
             .map(|value: f64| deviation * value);
         let noisy = self
             .chain
-            .run_with_noise(&members(model), model.nuisance, Some(&mut noise));
+            .run_with_noise(&members(model), &model.nuisance, Some(&mut noise));
         self.thinned(noisy)
             .iter()
             .zip(predicted)
@@ -470,12 +483,12 @@ impl<'a> Workbench<'a> {
 
     /// The simulation up to a member; see [`Chain::begin`].
     pub fn begin(&self, model: &Model, member: usize) -> Begun<'a> {
-        self.chain.begin(&members(model), model.nuisance, member)
+        self.chain.begin(&members(model), &model.nuisance, member)
     }
 
     /// The rest of it at the rows that count, the member's values being others.
     pub fn go_on(&self, begun: &Begun<'a>, model: &Model) -> Vec<f64> {
-        let all = self.chain.go_on(begun, &members(model), model.nuisance);
+        let all = self.chain.go_on(begun, &members(model), &model.nuisance);
         self.thinned(all)
     }
 
@@ -483,10 +496,10 @@ impl<'a> Workbench<'a> {
     pub fn vary(&self, model: &Model, others: &[(Change, Model)]) -> Vec<Vec<f64>> {
         let variations: Vec<Variation<'_>> = others
             .iter()
-            .map(|(change, other)| (*change, members(other), other.nuisance))
+            .map(|(change, other)| (*change, members(other), other.nuisance.clone()))
             .collect();
         self.chain
-            .vary(&members(model), model.nuisance, &variations, |all| {
+            .vary(&members(model), &model.nuisance, &variations, |all| {
                 self.thinned(all)
             })
     }

@@ -36,9 +36,11 @@ pub struct Shift {
 
 impl Shift {
     /// What was found for one signal; of each value the first that says something counts.
-    pub fn take(&mut self, nuisance: Nuisance) {
+    pub fn take(&mut self, nuisance: &Nuisance) {
+        // What is stated is the start of the first operation.
+        let soc_shift = nuisance.soc_shift.first().copied().unwrap_or_default();
         for (mine, found) in [
-            (&mut self.soc, nuisance.soc_shift),
+            (&mut self.soc, soc_shift),
             (&mut self.resistance, nuisance.resistance),
             (&mut self.alignment_s, nuisance.alignment_s),
         ] {

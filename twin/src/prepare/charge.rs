@@ -69,7 +69,7 @@ pub(super) fn item(
     let interval_s = spec.interval_s.unwrap_or(INTERVAL_S);
     let mut step_c = board.map_or(spec.step_c, Board::charge_step_c);
     if step_c <= 0.0
-        && work.purpose == Purpose::Compare
+        && work.purpose.compares()
         && let Some(found_c) = shown_step_c(drive, &readings, sensor.held_reference)
     {
         step_c = found_c;
@@ -82,7 +82,7 @@ pub(super) fn item(
         .reference
         .iter()
         .fold(0.0_f64, |most, i| most.max(i.abs()));
-    if work.purpose == Purpose::Compare {
+    if work.purpose.compares() {
         checks::counter(drive, &readings, interval_s, work.frame.source(), column)?;
     }
     let (drive, mut observed, rows, resets) =

@@ -19,6 +19,7 @@ pub fn noise(seed: u64, deviation: f64) -> impl FnMut() -> f64 {
 }
 
 /// What is said of a problem, with effects taken out of the library.
+#[allow(dead_code, reason = "not every test explains problems")]
 pub fn said(problem: Problem, seed: u64, without: &[&str]) -> Report {
     let options = Options {
         seed,

@@ -1,0 +1,197 @@
+//! The state of charge at which a recording begins, and each operation of it.
+
+use std::ops::Range;
+
+use super::{Purpose, Work};
+use crate::{
+    effects::scene::{gap_ah, mean_flow},
+    explain::fit::BASE_OFF,
+    model::Battery,
+    problem::{BatteryBase, Drive, Observed, View},
+};
+
+/// Uncertainty of a cell's voltage from which a state of charge is taken: what the cell has not relaxed from, in V.
+const AT_REST_V: f64 = 0.010;
+/// Uncertainty of a reading of the state of charge, 0 … 1.
+const OF_READING: f64 = 0.005;
+/// No reading is worth less than this uncertainty, 0 … 1: where the open-circuit voltage is flat it tells nothing.
+const WORTH: f64 = 0.3;
+/// A tester's counter is believed over a gap if it has followed the current within this share of the capacity before.
+const COUNTER_SHARE: f64 = 0.02;
+
+/// What was recorded of a battery.
+pub(super) struct Readings<'a> {
+    pub drive: &'a Drive,
+    /// Row of the frame that each row of the drive is from.
+    pub rows: &'a [usize],
+    /// Clock of each segment.
+    pub clocks: &'a [usize],
+    pub observed: &'a Observed,
+    pub view: View,
+    /// Column of the readings.
+    pub name: &'a str,
+    /// Noise of a reading that the model file states, rms, in the view's unit.
+    pub noise: f64,
+}
+
+/// A state of charge with its standard uncertainty, both 0 … 1.
+type Soc = (f64, f64);
+
+/// Finds the state of charge at the start of each segment, and how uncertain it is at the start of each operation.
+pub(super) fn find(
+    work: &mut Work<'_>,
+    base: &mut BatteryBase,
+    readings: &Readings<'_>,
+    battery: &Battery,
+) {
+    let drive = readings.drive;
+    let counter = work.drive_frame().column("ah_meas_ah");
+    let counter: Option<Vec<f64>> =
+        counter.map(|ah| readings.rows.iter().map(|row| ah[*row]).collect());
+    let mut end = 1.0;
+    let mut bridged = 0;
+    for (index, own) in drive.segments.iter().enumerate() {
+        let mut excess_ah = 0.0;
+        let first = if drive.is_continued(index) {
+            let gap_s = drive.t_s[own.start] - drive.t_s[own.start - 1];
+            let ends_a = [drive.reference[own.start - 1], drive.reference[own.start]];
+            let before = &drive.segments[index - 1];
+            let counted = counter
+                .as_ref()
+                .and_then(|ah| over_gap(ah, drive, before.clone(), own.start, battery.capacity_ah));
+            match counted {
+                Some(ah) => excess_ah = ah - gap_ah(ends_a, gap_s, 0.0, 1.0),
+                None => bridged += 1,
+            }
+            end - gap_ah(ends_a, gap_s, excess_ah, battery.efficiency) / battery.capacity_ah
+        } else {
+            let (first, sigma) = begun(work, base, readings, battery, index);
+            base.initial_soc_sigma.push(sigma);
+            first
+        };
+        base.initial_soc.push(first);
+        base.gap_excess_ah.push(excess_ah);
+        end = first - charge_ah(drive, own.clone(), battery.efficiency) / battery.capacity_ah;
+    }
+    if bridged > 0 {
+        work.remark(format!(
+            "{bridged} gaps in the current: the charge over them is taken from a straight line between its ends"
+        ));
+    }
+}
+
+/// Where an operation begins, at a segment: as stated, if that is of this operation, else as its first reading tells.
+fn begun(
+    work: &mut Work<'_>,
+    base: &BatteryBase,
+    readings: &Readings<'_>,
+    battery: &Battery,
+    index: usize,
+) -> Soc {
+    let sigma = battery.initial_soc_uncertainty;
+    let stated = battery.initial_soc.map(|soc| (soc, sigma));
+    let stated = stated.filter(|_| readings.clocks[index] == 0);
+    let name = readings.name;
+    let seen = if stated.is_some() && work.purpose == Purpose::Compare {
+        None
+    } else {
+        seen(base, readings, index)
+    };
+    let told = |(soc, sigma): Soc| format!("{:.1} % ± {:.1} %", 100.0 * soc, 100.0 * sigma);
+    match (stated, seen) {
+        (Some(stated), None) => stated,
+        // What is stated is said of the fitted recording: another one may begin there too, but need not.
+        (Some(stated), Some(seen)) => {
+            let apart = (stated.0 - seen.0).abs();
+            if apart <= BASE_OFF * stated.1.hypot(seen.1) {
+                return (stated.0, stated.1.max(seen.1));
+            }
+            work.remark(format!(
+                "{name} does not begin at the stated initial_soc of {:.1} %: {} taken from its first reading",
+                100.0 * stated.0,
+                told(seen)
+            ));
+            seen
+        }
+        (None, Some(seen)) => {
+            work.remark(format!(
+                "initial_soc is not stated: {} taken from the first reading of {name}{}",
+                told(seen),
+                if index == 0 {
+                    String::new()
+                } else {
+                    format!(" of stretch {}", index + 1)
+                }
+            ));
+            (seen.0, sigma.max(seen.1))
+        }
+        (None, None) => {
+            work.remark(format!(
+                "initial_soc is not stated and {name} does not tell it: a full battery is assumed"
+            ));
+            (1.0, 1.0)
+        }
+    }
+}
+
+/// Ah over a segment: straight lines, charging times the efficiency.
+fn charge_ah(drive: &Drive, rows: Range<usize>, efficiency: f64) -> f64 {
+    let mut charge = 0.0;
+    for row in rows.start + 1..rows.end {
+        let mean_a = mean_flow(drive.reference[row - 1], drive.reference[row], efficiency);
+        charge += mean_a * (drive.t_s[row] - drive.t_s[row - 1]);
+    }
+    charge / 3600.0
+}
+
+/// What a tester's counter says of a gap, if it followed the current before.
+fn over_gap(
+    ah: &[f64],
+    drive: &Drive,
+    before: Range<usize>,
+    after: usize,
+    capacity_ah: f64,
+) -> Option<f64> {
+    let last = before.end - 1;
+    let counted = ah[last] - ah[before.start];
+    let flowed = charge_ah(drive, before, 1.0);
+    let over = ah[after] - ah[last];
+    let follows = (counted - flowed).abs() <= COUNTER_SHARE * capacity_ah;
+    (follows && over.is_finite() && over.abs() <= capacity_ah).then_some(over)
+}
+
+/// State of charge at the start of a segment from its first reading.
+fn seen(base: &BatteryBase, readings: &Readings<'_>, segment: usize) -> Option<Soc> {
+    let (drive, observed) = (readings.drive, readings.observed);
+    let mut rows = (0..observed.t_s.len()).filter(|row| observed.segment_of(*row) == segment);
+    let row = rows.find(|row| observed.valid[*row] && observed.value[*row].is_finite())?;
+    let value = observed.value[row];
+    // Noise of that one reading, and what rounding takes of it.
+    let noise = readings.noise.hypot(observed.grid / 12f64.sqrt());
+    if readings.view == View::StateOfCharge {
+        return Some((value / 100.0, OF_READING.hypot(noise / 100.0)));
+    }
+    let current_a = drive.reference[drive.segments[segment].start];
+    let (soc, slope) = inverse(&base.ocv, value + base.resistance_ohm * current_a)?;
+    // A voltage under load says little.
+    let loaded_v = 0.5 * base.resistance_ohm * current_a.abs();
+    let within_v = (base.cells * AT_REST_V + loaded_v).hypot(noise);
+    Some((soc, (within_v / slope).min(WORTH)))
+}
+
+/// State of charge at an open-circuit voltage, and the slope there in V.
+fn inverse(ocv: &[(f64, f64)], volts: f64) -> Option<(f64, f64)> {
+    let (first, last) = (ocv.first()?, ocv.last()?);
+    let pair = ocv
+        .windows(2)
+        .find(|pair| pair[0].1 <= volts && volts <= pair[1].1 && pair[1].1 > pair[0].1);
+    let end = |pair: &[(f64, f64)]| ((pair[1].1 - pair[0].1) / (pair[1].0 - pair[0].0)).max(1e-3);
+    match pair {
+        Some(pair) => {
+            let share = (volts - pair[0].1) / (pair[1].1 - pair[0].1);
+            Some((pair[0].0 + share * (pair[1].0 - pair[0].0), end(pair)))
+        }
+        None if volts < first.1 => Some((first.0, end(&ocv[..2]))),
+        None => Some((last.0, end(&ocv[ocv.len() - 2..]))),
+    }
+}
