@@ -181,6 +181,8 @@ def voltage(drive: Drive, cell: Design, hidden: dict[str, Values]) -> np.ndarray
         temp_c = warmed(i, temp_c, cell, **hidden["cell-self-heating"])
     if "resistance-temperature" in hidden:
         cell = dataclasses.replace(cell, arrhenius_k=hidden["resistance-temperature"]["b_k"])
+    if "resistance" in hidden:
+        cell = dataclasses.replace(cell, resistance_ohm=cell.resistance_ohm * hidden["resistance"]["scale"])
     factor = cell.resistance_factor(temp_c)
     if "resistance-soc" in hidden:
         law = hidden["resistance-soc"]
@@ -246,6 +248,7 @@ PARAMETERS = {
     "polarisation": lambda size, draw, sign: {"r1_ohm": size, "tau1_s": draw["tau1_s"]},
     "diffusion": lambda size, draw, sign: {"r_ohm": size, "tau_s": draw["tau_s"]},
     "ocv-hysteresis": lambda size, draw, sign: {"m_v": size, "gamma": draw["gamma"]},
+    "resistance": lambda size, draw, sign: {"scale": float(np.exp(sign * size))},
     "resistance-temperature": lambda size, draw, sign: {"b_k": 1000.0 * size},
     "resistance-soc": lambda size, draw, sign: {"rise": size, "knee_soc": 0.45},
     "cell-self-heating": lambda size, draw, sign: {"rth_k_per_w": size, "tau_s": draw["heat_tau_s"]},
@@ -256,10 +259,11 @@ PARAMETERS = {
     "ocv-step": lambda size, draw, sign: {"step_v": sign * size, "soc": draw["step_soc"], "width_soc": 0.004},
     "charge-resistance": lambda size, draw, sign: {"ohm": sign * size},
 }
-SIGNED = ("capacity", "offset", "entropic", "voltage-gain", "ocv-step", "charge-resistance")
+SIGNED = ("capacity", "offset", "resistance", "entropic", "voltage-gain", "ocv-step", "charge-resistance")
 FIRST_SIZE = {
     "capacity": 0.01, "coulombic-efficiency": 0.01, "parasitic-load": 0.02, "offset": 0.02, "polarisation": 1e-3, "diffusion": 2e-3,
-    "ocv-hysteresis": 2e-3, "resistance-temperature": 0.3, "resistance-soc": 0.1, "cell-self-heating": 1.0, "entropic": 1e-4,
+    "ocv-hysteresis": 2e-3, "resistance": 0.05, "resistance-temperature": 0.3, "resistance-soc": 0.1,
+    "cell-self-heating": 1.0, "entropic": 1e-4,
     "voltage-gain": 0.01, "contact-resistance-rise": 1e-3, "loose-contact": 1e-3,
     "ocv-step": 1e-3, "charge-resistance": 1e-3,
 }
@@ -384,6 +388,9 @@ def truth(hidden: dict[str, Values]) -> dict:
     if "contact-resistance-rise" in hidden:
         allowed.append("resistance-soc")
         why = "In a drive without a charge time and state of charge go together: rising with the one is falling with the other."
+    if {"contact-resistance-rise", "loose-contact"} & set(hidden):
+        # Within the ohmic resistance as it is measured, and over the drive it has a mean.
+        allowed.append("resistance")
     names = {effect: ["parasitic-load", "offset"] if effect == "offset" else [effect] for effect in hidden}
     return {
         "kind": "c", "maker": f"own equations, scipy {scipy.__version__} solve_ivp LSODA",

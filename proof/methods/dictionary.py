@@ -384,6 +384,9 @@ def battery_entries(recording: Series) -> list[Entry]:
     gammas, knees = np.geomspace(3, 3000, 7), np.array([0.1, 0.2, 0.35, 0.6])
     out += spread("ocv-hysteresis", ocv_hysteresis, "gamma", gammas, coefficients=(("m_v", 0.0),), positive=True)
     out += spread("resistance-soc", soc_resistance, "knee_soc", knees, coefficients=(("rise", 0.0),), positive=True)
+    if recording.battery.resistance_exact and recording.battery.resistance_ohm:
+        # One that is uncertain is a nuisance.
+        out.append(Entry("resistance", lambda s, _: -ohms(s) * s.x, coefficients=(("scale", 1.0),)))
     if "temperature_c" in recording.other:
         out += [
             Entry("resistance-temperature", arrhenius, positive=True),

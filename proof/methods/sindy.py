@@ -40,6 +40,7 @@ SENSOR_TERMS = {
     "sign(dx)": ["core-hysteresis"],
 }
 BATTERY_TERMS = {
+    "x": ["resistance"],
     "T": ["entropic"],
     "x T": ["resistance-temperature"],
     "x soc": ["resistance-soc"],
