@@ -8,11 +8,15 @@
 mod elsewhere;
 pub mod fit;
 pub mod flexible;
+pub mod held_out;
 pub mod intervals;
 pub mod locate;
+pub mod normal;
+pub mod robust;
 pub mod screen;
 pub mod select;
 pub mod shape;
+pub mod slope;
 mod starts;
 mod told;
 mod trust;
@@ -207,7 +211,7 @@ impl Course<'_> {
 /// By how much the loss is smaller with the second of two fits, both in the smaller spread.
 fn gained(one: &Fit, other: &Fit) -> f64 {
     let sigma = one.sigma.min(other.sigma);
-    fit::loss(&one.residual, sigma) - fit::loss(&other.residual, sigma)
+    robust::loss(&one.residual, sigma) - robust::loss(&other.residual, sigma)
 }
 
 /// One signal: decided with the reference in straight lines, and again with a smooth one where that may be better.
@@ -274,7 +278,7 @@ fn tell(
     let noise = if problem.noise > 0.0 {
         problem.noise
     } else {
-        fit::spread(&jumps(&shown.residual)) / std::f64::consts::SQRT_2
+        robust::spread(&jumps(&shown.residual)) / std::f64::consts::SQRT_2
     };
     report.signals.push(SignalReport {
         name: problem.name.clone(),

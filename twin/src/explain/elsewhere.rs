@@ -1,7 +1,10 @@
 //! Whether a recording that began at another state of charge than the simulation would look like what is named.
 
-use super::fit::{BASE_OFF, fit, held_out, loss};
+use super::fit::fit;
+use super::held_out::held_out;
+use super::robust::loss;
 use super::select::{self, Selection, percent};
+use super::slope::BASE_OFF;
 use super::workbench::{Model, Workbench};
 use crate::problem::{Base, Problem};
 

@@ -6,7 +6,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 use rayon::prelude::*;
 
-use super::fit::{TUNING, dot, normal, solve, spread};
+use super::normal::{dot, normal, solve};
+use super::robust::{TUNING, spread};
 use super::screen::{Folds, ITSELF, Turn, turned_products};
 use super::workbench::Workbench;
 use crate::effects::scene::{Cursor, Steps};

@@ -21,9 +21,10 @@ use std::ops::Range;
 
 use nalgebra::{DMatrix, DVector};
 
-use super::fit::{
-    Fit, Slope, change, dot, fit as refit, huber, loss, normal, rounds, solve, weights,
-};
+use super::fit::{Fit, fit as refit};
+use super::normal::{dot, normal, solve};
+use super::robust::{huber, loss, weights};
+use super::slope::{Slope, change, rounds};
 use super::workbench::{Model, Workbench};
 use crate::effects::{Parameter, Search};
 

@@ -12,7 +12,9 @@ use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 use rayon::prelude::*;
 use rustfft::{Fft, FftPlanner, num_complex::Complex};
 
-use super::fit::{Fit, Solver, TUNING, dot, huber, normal, spread};
+use super::fit::Fit;
+use super::normal::{Solver, dot, normal};
+use super::robust::{TUNING, huber, spread};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::scene::Scale;
 use crate::effects::{Effect, Search};

@@ -2,9 +2,13 @@
 
 use rayon::prelude::*;
 
-use super::fit::{Fit, change, dot, fit, held_out, huber, loss, polish};
+use super::fit::{Fit, fit, polish};
+use super::held_out::held_out;
+use super::normal::dot;
+use super::robust::{huber, loss};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
 use super::shape::without_memory;
+use super::slope::change;
 use super::told::short;
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Effect, Search, Stage, find};

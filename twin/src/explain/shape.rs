@@ -5,9 +5,11 @@
 //! keeps its colour). What the free curve still finds is set against what *that effect* takes, not against the whole: a wrong
 //! shape can take most of a mismatch and leave little.
 
-use super::fit::{self, Fit, ahead_of_grid, change, dot, normal, solve};
+use super::fit::{self, Fit, ahead_of_grid};
 use super::flexible::Features;
+use super::normal::{dot, normal, solve};
 use super::select::{Selection, percent};
+use super::slope::change;
 use super::workbench::Workbench;
 use crate::problem::{Base, View};
 

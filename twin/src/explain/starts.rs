@@ -2,7 +2,9 @@
 
 use std::ops::Range;
 
-use super::fit::{BASE_OFF, dot, huber, spread, weights};
+use super::normal::dot;
+use super::robust::{huber, spread, weights};
+use super::slope::BASE_OFF;
 use super::workbench::{Model, Workbench};
 use crate::effects::chain::Nuisance;
 use crate::problem::{Base, Problem};
@@ -158,7 +160,7 @@ pub(super) fn begun(bench: &Workbench<'_>, model: Model) -> (Model, Vec<f64>) {
             };
             start.shift(&mut moved.nuisance, by);
         }
-        let change = super::fit::change(&bench.run(&moved), &predicted);
+        let change = super::slope::change(&bench.run(&moved), &predicted);
         let mut there = here.clone();
         for start in starts {
             let by = start.at(&moved.nuisance) - start.at(&here.nuisance);

@@ -1,8 +1,9 @@
 //! What the report says of one signal: its effects, its places, its plots and its sentence.
 
-use super::fit::{BASE_OFF, Fit, at_base_end};
+use super::fit::Fit;
 use super::flexible::Explainable;
 use super::select::{Selection, percent};
+use super::slope::{BASE_OFF, at_base_end};
 use super::workbench::{Member, Workbench};
 use super::{Nuisance, intervals, locate};
 use crate::effects::find;

@@ -2,6 +2,7 @@
 
 use super::fit::{self, Fit};
 use super::intervals::{self, Variation};
+use super::robust::loss;
 use super::select::{self, Selection, percent};
 use super::told::short;
 use super::unfitted::{Unfitted, confirmed};
@@ -163,7 +164,7 @@ fn stand_in(
     let sigma = fits
         .iter()
         .fold(selection.fit.sigma, |least, fit| least.min(fit.sigma));
-    let loss = |fit: &Fit| fit::loss(&fit.residual, sigma);
+    let loss = |fit: &Fit| loss(&fit.residual, sigma);
     fits.sort_by(|a, b| loss(a).total_cmp(&loss(b)));
     let found = fits.into_iter().find(|fit| {
         let last = fit.model.members.len() - 1;

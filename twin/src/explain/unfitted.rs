@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use super::fit;
+use super::normal::dot;
 use super::starts::begun;
 use super::told::short;
 use super::trust::{WAVERS, roughness};
@@ -126,14 +127,14 @@ impl<'a> Unfitted<'a> {
         let blocks = &self.bench.blocks;
         let energy: f64 = blocks
             .iter()
-            .map(|rows| fit::dot(&change[rows.clone()], &change[rows.clone()]))
+            .map(|rows| dot(&change[rows.clone()], &change[rows.clone()]))
             .sum();
         if blocks.len() < 2 || energy <= 0.0 {
             return None;
         }
         let along: f64 = blocks
             .iter()
-            .map(|rows| fit::dot(&change[rows.clone()], &mismatch[rows.clone()]))
+            .map(|rows| dot(&change[rows.clone()], &mismatch[rows.clone()]))
             .sum();
         let times = along / energy;
         let scatter: f64 = blocks

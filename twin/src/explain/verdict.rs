@@ -1,8 +1,11 @@
 //! The verdict on one signal: what a true model would leave, what is left, and what that says of the names.
 
-use super::fit::{self, Fit};
+use super::fit::Fit;
 use super::flexible::{Explainable, Features};
+use super::normal::dot;
+use super::robust::spread;
 use super::select::{self, Selection, percent};
+use super::slope::change;
 use super::told::short;
 use super::workbench::{Member, Workbench};
 use super::{Held, intervals, jumps, rms};
@@ -86,7 +89,7 @@ pub(super) fn judge(
     // A drift that is slower than the stated noise hides in it once that was made white: not as it was read.
     let seen = |fit: &Fit| {
         let as_read = bench.as_read(&fit.residual);
-        fit::dot(&as_read, &as_read)
+        dot(&as_read, &as_read)
     };
     let rest_read = seen(&selection.fit);
     // As a share of what the named effects take.
@@ -115,7 +118,7 @@ pub(super) fn judge(
         // What the model file's own equations may be off by is no sign of another physics.
         let ratio = (smooth.max(beyond) - bench.modelled).max(0.0) / explained.max(1e-300);
         let ratio = ratio.max(drift);
-        let change = fit::change(&selection.fit.predicted, &selection.plain.predicted);
+        let change = change(&selection.fit.predicted, &selection.plain.predicted);
         let (shape, change) = features.shape(&selection.fit.residual, &change);
         let alike = if smooth > 0.0 {
             correlation(&shape, &change)
@@ -164,7 +167,7 @@ fn without_names(bench: &Workbench<'_>, selection: &mut Selection, before: Expla
     let (floor, times, of) = if noise > 0.0 {
         (known, LOUD, "the noise that the model file states")
     } else {
-        let jumps = fit::spread(&jumps(residual)) / std::f64::consts::SQRT_2;
+        let jumps = spread(&jumps(residual)) / std::f64::consts::SQRT_2;
         (
             known.max(jumps),
             SLOW,
@@ -190,7 +193,7 @@ fn without_names(bench: &Workbench<'_>, selection: &mut Selection, before: Expla
         Verdict::Unknown
     } else if before.is_real()
         && before.share > STRUCTURE
-        && before.share * fit::dot(residual, residual) > fit::dot(&inaccurate, &inaccurate)
+        && before.share * dot(residual, residual) > dot(&inaccurate, &inaccurate)
     {
         selection.decisions.push(format!(
             "No effect passes, yet a smooth function of the recorded inputs takes {} of the held-out error (placebos up to {}): unknown.",

@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::{Purpose, Work};
 use crate::{
     effects::scene::{gap_ah, mean_flow},
-    explain::fit::BASE_OFF,
+    explain::slope::BASE_OFF,
     model::Battery,
     problem::{BatteryBase, Drive, Observed, View},
 };
