@@ -127,6 +127,21 @@ fn a_rail_ahead_of_the_noise_is_no_certain_core() {
 }
 
 #[test]
+fn a_sensitivity_error_read_in_steps_is_no_rail() {
+    // The highest step stays below what was expected, as all of them do.
+    for seed in 0..6 {
+        let report = explained(seed, true, |i| (0.985 * i / 1.2).round() * 1.2);
+        let ids: Vec<&str> = report
+            .effects
+            .iter()
+            .map(|effect| effect.id.as_str())
+            .collect();
+        assert!(!ids.contains(&"clipping"), "{seed}: {}", report.summary);
+        assert!(ids.contains(&"gain"), "{seed}: {}", report.summary);
+    }
+}
+
+#[test]
 fn a_current_that_stays_at_its_highest_value_is_no_rail() {
     // Charging at a constant current, told in steps: both hold the value, and agree.
     for seed in 0..6 {

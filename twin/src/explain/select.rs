@@ -305,10 +305,12 @@ fn marked(
         let mut base = now.model.clone();
         base.members
             .retain(|member| member.id() != card.id && !card.looks_like.contains(&member.id()));
-        let residual = bench.as_read(&now.residual);
-        let energy = dot(&residual, &residual) / residual.len().max(1) as f64;
-        let gain = (mark.variance / energy.max(1e-300)).min(1.0);
-        if gain < FLOOR {
+        let left = |fit: &Fit| {
+            let residual = bench.as_read(&fit.residual);
+            dot(&residual, &residual) / residual.len().max(1) as f64
+        };
+        let energy = left(&now).max(1e-300);
+        if mark.variance < FLOOR * energy {
             continue;
         }
         let smooth = missed(bench, fit(bench, &base, None));
@@ -320,13 +322,21 @@ fn marked(
         let stepped = Fit::of(bench, model, smooth.cost);
         let members = &stepped.model.members;
         // Where noise goes to and fro over the edges, rounding the simulation adds at most a second rounding error.
-        let there = bench.as_read(&stepped.residual);
-        let most = NO_LARGER * energy + DITHERED * mark.rounding;
-        if dot(&there, &there) / there.len().max(1) as f64 > most {
+        let there = left(&stepped);
+        if there > NO_LARGER * energy + DITHERED * mark.rounding {
             decisions.push(format!(
                 "{} not added, though the readings {}: it makes the error larger than noise ahead of it would.",
                 card.id, mark.what
             ));
+            continue;
+        }
+        // What a rail seems to cut off may be what another effect, or the fit, has taken away already.
+        let gain = if mark.rounding > 0.0 {
+            (mark.variance / energy).min(1.0)
+        } else {
+            1.0 - there / left(&smooth).max(1e-300)
+        };
+        if gain < FLOOR {
             continue;
         }
         decisions.push(format!(
