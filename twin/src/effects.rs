@@ -296,7 +296,7 @@ pub trait Effect: Sync {
         1.0
     }
 
-    /// What the readings show by themselves, whatever the simulation says.
+    /// What the readings show of it by themselves, or beside the simulation as designed, without a fit.
     fn mark(&self, _scale: &Scale, _clues: &Clues<'_>) -> Option<Mark> {
         None
     }
@@ -389,17 +389,16 @@ pub trait Effect: Sync {
     }
 }
 
-/// An effect that shows without a simulation.
+/// An effect that shows without a fit.
 #[derive(Clone, Debug)]
 pub struct Mark {
     /// A value for each of its parameters.
     pub values: Vec<f64>,
     /// How far each of them may be off.
     pub within: Vec<f64>,
-    /// Variance that it adds to the residual, in the view's unit squared.
+    /// Variance that it adds to the residual, in the view's unit squared. If it rounds ([`Effect::rounds`]), a simulation that
+    /// rounds too has as much again where noise is ahead of the grid.
     pub variance: f64,
-    /// The part of it that is rounding: a simulation that rounds too has as much again where noise is ahead of the grid.
-    pub rounding: f64,
     /// What the readings do.
     pub what: &'static str,
 }

@@ -50,6 +50,10 @@ fn names(folder: &Path) -> Vec<String> {
     names
 }
 
+fn explain_with<'a>(more: &[&'a str]) -> Vec<&'a str> {
+    EXPLAIN.iter().chain(more).copied().collect()
+}
+
 fn explained(model: &str, recording: &str) -> String {
     refused(&[("m.toml", model), ("r.csv", recording)], &EXPLAIN)
 }
@@ -130,17 +134,7 @@ fn a_clock_that_no_clock_is() {
             ("r.csv", &recorded("sensor")),
             ("ref.csv", &in_ms),
         ],
-        &[
-            "explain",
-            "--model",
-            "m.toml",
-            "--recording",
-            "r.csv",
-            "--reference",
-            "ref.csv",
-            "--out",
-            "out",
-        ],
+        &explain_with(&["--reference", "ref.csv"]),
     );
     says(
         &sentence,
@@ -230,19 +224,7 @@ fn a_hold_out_needs_its_own_reference() {
             ("ref.csv", &reference),
             ("other.csv", &sensor),
         ],
-        &[
-            "explain",
-            "--model",
-            "m.toml",
-            "--recording",
-            "r.csv",
-            "--reference",
-            "ref.csv",
-            "--holdout",
-            "other.csv",
-            "--out",
-            "out",
-        ],
+        &explain_with(&["--reference", "ref.csv", "--holdout", "other.csv"]),
     );
     says(
         &sentence,
@@ -289,20 +271,18 @@ fn the_proposed_mapping_is_taken() {
         + &rows(300, |t| format!("{t},{},{}", current(t), -current(t)));
     fs::write(folder.path().join("m.toml"), PAIR).unwrap();
     fs::write(folder.path().join("r.csv"), recording).unwrap();
-    let output = Command::new(env!("CARGO_BIN_EXE_twin"))
-        .args([
-            "simulate",
-            "--model",
-            "m.toml",
-            "--recording",
-            "r.csv",
-            "--out",
-            "s.csv",
-        ])
-        .args(["--map", "i_meas_a=-i_meas_a"])
-        .current_dir(folder.path())
-        .output()
-        .unwrap();
+    let arguments = [
+        "simulate",
+        "--model",
+        "m.toml",
+        "--recording",
+        "r.csv",
+        "--out",
+        "s.csv",
+        "--map",
+        "i_meas_a=-i_meas_a",
+    ];
+    let output = twin(folder.path(), &arguments);
     assert_eq!(output.status.code(), Some(0), "{output:?}");
 }
 
@@ -332,17 +312,7 @@ fn a_reference_of_another_time() {
             ("r.csv", &sensor),
             ("ref.csv", &reference),
         ],
-        &[
-            "explain",
-            "--model",
-            "m.toml",
-            "--recording",
-            "r.csv",
-            "--reference",
-            "ref.csv",
-            "--out",
-            "out",
-        ],
+        &explain_with(&["--reference", "ref.csv"]),
     );
     says(&sentence, &["ref.csv", "r.csv", "overlap in time"]);
 }
@@ -495,19 +465,7 @@ fn an_implausible_reference_is_said_to_be_one() {
             format!("{t},{reference},{}", current(t))
         });
     fs::write(folder.path().join("r.csv"), recording).unwrap();
-    let output = Command::new(env!("CARGO_BIN_EXE_twin"))
-        .args([
-            "explain",
-            "--model",
-            "m.toml",
-            "--recording",
-            "r.csv",
-            "--out",
-            "out",
-        ])
-        .current_dir(folder.path())
-        .output()
-        .unwrap();
+    let output = twin(folder.path(), &EXPLAIN);
     assert_eq!(output.status.code(), Some(0), "{output:?}");
     let report = fs::read_to_string(folder.path().join("out/report.json")).unwrap();
     says(
@@ -525,13 +483,7 @@ fn report(files: &[(&str, &str)], arguments: &[&str]) -> serde_json::Value {
     for (name, content) in files {
         fs::write(folder.path().join(name), content).unwrap();
     }
-    let output = Command::new(env!("CARGO_BIN_EXE_twin"))
-        .args(["explain", "--model", "m.toml", "--recording", "r.csv"])
-        .args(["--out", "out"])
-        .args(arguments)
-        .current_dir(folder.path())
-        .output()
-        .unwrap();
+    let output = twin(folder.path(), &explain_with(arguments));
     assert_eq!(output.status.code(), Some(0), "{output:?}");
     let report = fs::read_to_string(folder.path().join("out/report.json")).unwrap();
     serde_json::from_str(&report).unwrap()
@@ -582,12 +534,7 @@ fn a_file_that_is_read_is_not_written() {
         ),
     ];
     for (first, rest, argument) in cases {
-        let output = Command::new(env!("CARGO_BIN_EXE_twin"))
-            .args(first)
-            .args(rest)
-            .current_dir(folder.path())
-            .output()
-            .unwrap();
+        let output = twin(folder.path(), &[first, rest].concat());
         let sentence = String::from_utf8(output.stderr).unwrap();
         if cfg!(unix) || !first.contains(&"link.csv") {
             assert_eq!(output.status.code(), Some(2), "{rest:?} {sentence}");
@@ -602,10 +549,9 @@ fn a_file_that_is_read_is_not_written() {
 #[test]
 fn a_hold_out_that_was_fitted() {
     let files = [("m.toml", PAIR), ("r.csv", &good()), ("copy.csv", &good())];
-    let arguments = ["explain", "--model", "m.toml", "--recording", "r.csv"];
-    let holdout = ["--out", "out", "--holdout", "copy.csv"];
+    let arguments = explain_with(&["--holdout", "copy.csv"]);
     says(
-        &refused(&files, &[&arguments[..], &holdout].concat()),
+        &refused(&files, &arguments),
         &[
             "copy.csv, column i_meas_a",
             "readings of r.csv",
@@ -620,7 +566,7 @@ fn a_hold_out_that_was_fitted() {
         });
     let files = [("m.toml", PAIR), ("r.csv", &good()), ("copy.csv", &shifted)];
     says(
-        &refused(&files, &[&arguments[..], &holdout].concat()),
+        &refused(&files, &arguments),
         &["copy.csv, column i_meas_a", "readings of r.csv"],
     );
     // Of the same drive, read anew.

@@ -5,8 +5,7 @@
 
 mod common;
 
-use common::{noise, said};
-use twin::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
+use common::{noise, said, sensor};
 use twin::report::data::{ParameterReport, Report};
 
 const ROWS: usize = 3000;
@@ -57,25 +56,8 @@ fn explained(reading: &[f64], seed: u64) -> Report {
     let mut noise = noise(seed, NOISE_A);
     let t_s: Vec<f64> = (0..ROWS).map(|row| row as f64 * STEP_S).collect();
     let value = rows().map(|at| reading[at] + noise()).collect();
-    let problem = Problem {
-        view: View::Sensor,
-        name: "i_meas_a".into(),
-        unit: "A".into(),
-        drive: Drive {
-            t_s: t_s.clone().into(),
-            reference: rows().map(|at| current[at]).collect(),
-            segments: std::iter::once(0..ROWS).collect(),
-            continues: vec![false],
-            ..Drive::default()
-        },
-        observed: Observed::with_drive(t_s, value),
-        base: Base::Sensor(SensorBase::default()),
-        modelled: Vec::new(),
-        noise: NOISE_A,
-        coloured: Coloured::default(),
-        accuracy: Accuracy::default(),
-    };
-    said(problem, seed, &[])
+    let reference = rows().map(|at| current[at]).collect();
+    said(sensor(t_s, reference, value, NOISE_A), seed, &[])
 }
 
 /// The value of the one effect that is named, with the ids that it may be.

@@ -10,10 +10,10 @@ mod common;
 
 use std::path::Path;
 
-use common::{noise, said};
+use common::{noise, said, sensor};
 
 use twin::explain::{Holdout, Options, explain};
-use twin::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
+use twin::problem::{Base, Coloured, Problem, SensorBase};
 use twin::report::data::{Report, Verdict};
 
 const ROWS: usize = 9000;
@@ -90,31 +90,17 @@ fn explained_as_read(
 
 /// Readings of the drive, under the model as designed.
 fn problem_of(truth: &Truth, value: Vec<f64>, coloured: Coloured) -> Problem {
-    let rows = value.len();
-    Problem {
-        view: View::Sensor,
-        name: "i_meas_a".into(),
-        unit: "A".into(),
-        drive: Drive {
-            t_s: truth.t_s.clone().into(),
-            reference: truth.current_a.clone().into(),
-            sensor_temperature_c: Some(truth.temperature_c.clone().into()),
-            range_high: Some(truth.high.clone().into()),
-            segments: std::iter::once(0..rows).collect(),
-            continues: vec![false],
-            ..Drive::default()
-        },
-        observed: Observed::with_drive(truth.t_s.clone(), value),
-        base: Base::Sensor(SensorBase {
-            full_scale: Some(600.0),
-            range_ratio: 10.0,
-            ..SensorBase::default()
-        }),
-        modelled: Vec::new(),
-        noise: NOISE_A,
-        coloured,
-        accuracy: Accuracy::default(),
-    }
+    let (t_s, current_a) = (truth.t_s.clone(), truth.current_a.clone());
+    let mut problem = sensor(t_s, current_a, value, NOISE_A);
+    problem.drive.sensor_temperature_c = Some(truth.temperature_c.clone().into());
+    problem.drive.range_high = Some(truth.high.clone().into());
+    problem.base = Base::Sensor(SensorBase {
+        full_scale: Some(600.0),
+        range_ratio: 10.0,
+        ..SensorBase::default()
+    });
+    problem.coloured = coloured;
+    problem
 }
 
 #[track_caller]

@@ -4,8 +4,7 @@
 
 mod common;
 
-use common::{noise, said};
-use twin::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
+use common::{noise, said, sensor};
 use twin::report::data::{Report, Verdict};
 
 const ROWS: usize = 4000;
@@ -43,25 +42,7 @@ fn explained(seed: u64, noise_before: bool, reading: impl Fn(f64) -> f64) -> Rep
             false => reading(*i) + noise(),
         })
         .collect();
-    let problem = Problem {
-        view: View::Sensor,
-        name: "i_meas_a".into(),
-        unit: "A".into(),
-        drive: Drive {
-            t_s: t_s.clone().into(),
-            reference: current.into(),
-            segments: std::iter::once(0..ROWS).collect(),
-            continues: vec![false],
-            ..Drive::default()
-        },
-        observed: Observed::with_drive(t_s, value),
-        base: Base::Sensor(SensorBase::default()),
-        modelled: Vec::new(),
-        noise: NOISE_A,
-        coloured: Coloured::default(),
-        accuracy: Accuracy::default(),
-    };
-    said(problem, seed, &[])
+    said(sensor(t_s, current, value, NOISE_A), seed, &[])
 }
 
 #[test]

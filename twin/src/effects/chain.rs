@@ -15,6 +15,14 @@ pub struct Nuisance {
     pub alignment_s: f64,
 }
 
+impl Nuisance {
+    /// The operation whose start is shifted most, from 0, and by how much (0 … 1).
+    pub fn largest_soc_shift(&self) -> Option<(usize, f64)> {
+        let shifts = self.soc_shift.iter().copied().enumerate();
+        shifts.max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))
+    }
+}
+
 /// Effects with their values.
 pub type Members<'a> = [(&'static dyn Effect, &'a [f64])];
 

@@ -75,7 +75,6 @@ impl Effect for Clipping {
                 .map(|rail| rail.as_ref().map_or(0.0, |rail| rail.within))
                 .to_vec(),
             variance: known.iter().map(|rail| rail.variance).sum(),
-            rounding: 0.0,
             what: "stay at an end",
         })
     }
@@ -132,12 +131,16 @@ fn rail(observed: impl Iterator<Item = f64>, predicted: impl Iterator<Item = f64
         .zip(predicted)
         .filter(|(y, p)| y.is_finite() && p.is_finite())
         .collect();
+    let at = rows.iter().map(|(y, _)| *y).reduce(f64::max)?;
+    let there = || rows.iter().filter(|(y, _)| *y == at);
+    let count = there().count();
+    if count < STAY {
+        return None;
+    }
     let middle = |mut values: Vec<f64>| -> Option<f64> {
         let at = values.len() / 2;
         (!values.is_empty()).then(|| *values.select_nth_unstable_by(at, f64::total_cmp).1)
     };
-    let at = rows.iter().map(|(y, _)| *y).reduce(f64::max)?;
-    let there = || rows.iter().filter(|(y, _)| *y == at);
     let spread = 1.4826 * middle(rows.iter().map(|(y, p)| (y - p).abs()).collect())?;
     let expected = middle(there().map(|(_, p)| *p).collect())?;
     let larger = rows.iter().filter(|(_, p)| *p > expected);
@@ -145,9 +148,7 @@ fn rail(observed: impl Iterator<Item = f64>, predicted: impl Iterator<Item = f64
         (all + 1.0, stay + f64::from(u8::from(*y == at)))
     });
     let hang = there().filter(|(_, p)| *p < at - CUT_OFF * spread).count();
-    let count = there().count();
-    if count < STAY
-        || larger == 0.0
+    if larger == 0.0
         || stay < NEARLY_ALL * larger
         || expected - at <= CUT_OFF * spread
         || hang as f64 > (1.0 - NEARLY_ALL) * count as f64

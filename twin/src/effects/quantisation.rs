@@ -57,7 +57,6 @@ impl Effect for Quantisation {
             within: vec![IN_STEP * step * step / (high - low).max(step)],
             // Evenly spread over a step.
             variance: step * step / 12.0,
-            rounding: step * step / 12.0,
             what: "lie on a grid",
         })
     }

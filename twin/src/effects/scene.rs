@@ -119,7 +119,7 @@ pub struct RangeChange {
 ///
 /// The limits, one on the way up and one on the way down (a hysteresis), are those that the fewest rows contradict. A current
 /// that reverses between two rows of the large range passes through the small one.
-fn range_changes(drive: &Drive, sensor: Option<&SensorBase>) -> Vec<RangeChange> {
+pub fn range_changes(drive: &Drive, sensor: Option<&SensorBase>) -> Vec<RangeChange> {
     let (Some(flag), Some(sensor)) = (&drive.range_high, sensor) else {
         return Vec::new();
     };

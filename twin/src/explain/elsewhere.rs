@@ -5,6 +5,7 @@ use super::held_out::held_out;
 use super::robust::loss;
 use super::select::{self, Selection, percent};
 use super::slope::BASE_OFF;
+use super::told::start_of;
 use super::workbench::{Model, Workbench};
 use crate::problem::{Base, Problem};
 
@@ -31,8 +32,7 @@ pub(super) fn elsewhere(bench: &Workbench<'_>, selection: &Selection) -> Option<
     };
     let moved = white.as_ref().unwrap_or(&read);
     let found = fit(moved, &Model::default(), None);
-    let shifts = found.model.nuisance.soc_shift.iter().copied().enumerate();
-    let (operation, shift) = shifts.max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))?;
+    let (operation, shift) = found.model.nuisance.largest_soc_shift()?;
     let sigma = base
         .initial_soc_sigma
         .get(operation)
@@ -48,7 +48,7 @@ pub(super) fn elsewhere(bench: &Workbench<'_>, selection: &Selection) -> Option<
         if operation == 0 {
             "at the start".to_owned()
         } else {
-            format!("at the start of operation {}", operation + 1)
+            start_of(operation)
         },
         100.0 * there,
         100.0 * stated

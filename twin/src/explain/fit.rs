@@ -4,7 +4,7 @@ use std::cmp::Ordering;
 use std::collections::HashSet;
 use std::sync::{Arc, OnceLock};
 
-use super::normal::{dot, normal, solve, sum_of};
+use super::normal::{dot, forget, normal, solve, sum_of};
 use super::robust::{huber, loss, spread, weight};
 use super::slope::{Slope, change, coordinates, rounds, slope, unrounded};
 use super::workbench::{Model, Workbench};
@@ -303,8 +303,8 @@ fn descend(aim: Aim<'_, '_>, here: &mut Point, known: Option<Slope>) -> Option<S
             normal(&slope.columns, &weights, &here.residual, 0..bench.len());
         slope.penalty(&mut matrix, &mut right);
         if let Some(used) = used {
-            let untold = |start: usize, _| !bench.starts[start].told_by(used);
-            slope.keep(None, (&mut matrix, &mut right), untold);
+            let untold = slope.starts(|start, _| !bench.starts[start].told_by(used));
+            forget(&untold, &mut matrix);
         }
         let mut gain = 0.0;
         for _ in 0..6 {

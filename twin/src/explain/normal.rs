@@ -6,6 +6,7 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
 /// Sums that are kept side by side.
 const LANES: usize = 8;
+
 /// Sum of what a function makes of two series, in lanes.
 pub(super) fn sum_of(a: &[f64], b: &[f64], part: impl Fn(f64, f64) -> f64) -> f64 {
     let (a_chunks, a_rest) = a.as_chunks::<LANES>();
@@ -74,9 +75,18 @@ pub fn normal(
     (matrix, right)
 }
 
+/// Forgets what is known of some values: a solution leaves them where they are.
+pub(super) fn forget(which: &[usize], matrix: &mut DMatrix<f64>) {
+    for &k in which {
+        matrix.row_mut(k).fill(0.0);
+        matrix.column_mut(k).fill(0.0);
+    }
+}
+
 /// A normal matrix made ready to be solved, with a little damping, scaled by the diagonal.
 #[derive(Clone, Debug)]
 pub struct Solver {
+    /// Without end where nothing is known.
     scale: Vec<f64>,
     factor: Option<Cholesky<f64, Dyn>>,
 }
@@ -88,7 +98,7 @@ impl Solver {
         let scale: Vec<f64> = (0..size)
             .map(|k| {
                 let d = matrix[(k, k)];
-                if d > 0.0 { d.sqrt() } else { 1.0 }
+                if d > 0.0 { d.sqrt() } else { f64::INFINITY }
             })
             .collect();
         let mut scaled = DMatrix::zeros(size, size);
@@ -122,10 +132,10 @@ impl Solver {
         }
     }
 
-    /// The most that a part of the matrix has of all that is known of some combination of values, 0 … 1; to the digit from `least` on.
-    pub(super) fn most_of(&self, part: &DMatrix<f64>, least: f64) -> f64 {
+    /// Whether a part of the matrix has this share, 0 … 1, of all that is known of some combination of the values.
+    pub(super) fn tells(&self, part: &DMatrix<f64>, share: f64) -> bool {
         let Some(factor) = &self.factor else {
-            return 0.0;
+            return false;
         };
         let scaled = DMatrix::from_fn(part.nrows(), part.ncols(), |a, b| {
             part[(a, b)] / (self.scale[a] * self.scale[b])
@@ -133,18 +143,10 @@ impl Solver {
         let half = factor.l_dirty().solve_lower_triangular(&scaled);
         let whole =
             half.and_then(|half| factor.l_dirty().solve_lower_triangular(&half.transpose()));
-        let Some(whole) = whole else {
-            return 0.0;
-        };
-        // None of them is negative: their sum is no less than the largest.
-        if whole.trace() < least {
-            return whole.trace();
-        }
+        // None of the eigenvalues is negative: the largest is no more than their sum.
         whole
-            .symmetric_eigenvalues()
-            .iter()
-            .copied()
-            .fold(0.0, f64::max)
+            .filter(|whole| whole.trace() >= share)
+            .is_some_and(|whole| whole.symmetric_eigenvalues().max() >= share)
     }
 
     /// Rows in parts of which each tells as much of the values as any other.

@@ -4,6 +4,7 @@ use super::normal::sum_of;
 
 /// Residuals beyond this many standard deviations count by their size, not by its square (Huber).
 pub const TUNING: f64 = 3.0;
+
 /// Spread by the median of absolute values, kept from vanishing where most residuals are nothing.
 pub fn spread(residual: &[f64]) -> f64 {
     let mut sizes: Vec<f64> = residual.iter().map(|r| r.abs()).collect();

@@ -63,14 +63,11 @@ const BEATEN: f64 = 2.0;
 const CHANCE: f64 = 1e-3;
 /// An effect would do as well as another if it takes at least this share of what that one takes.
 const EQUAL: f64 = 0.5;
-
-/// A simulation that is rounded may be off by this many times the variance of rounding more than one that is not: by once where noise
-/// is as loud as a step, and chance.
+/// A simulation that is rounded may be off by this many times the variance of rounding more than one that is not: by once where
+/// noise is as loud as a step, and chance.
 const DITHERED: f64 = 1.1;
-
 /// An error that is larger by less than this factor is not.
 const NO_LARGER: f64 = 1.01;
-
 /// Rounds of adding, doing without and exchanging.
 const ROUNDS: usize = 3;
 
@@ -323,7 +320,8 @@ fn marked(
         let members = &stepped.model.members;
         // Where noise goes to and fro over the edges, rounding the simulation adds at most a second rounding error.
         let there = left(&stepped);
-        if there > NO_LARGER * energy + DITHERED * mark.rounding {
+        let rounding = if effect.rounds() { mark.variance } else { 0.0 };
+        if there > NO_LARGER * energy + DITHERED * rounding {
             decisions.push(format!(
                 "{} not added, though the readings {}: it makes the error larger than noise ahead of it would.",
                 card.id, mark.what
@@ -331,7 +329,7 @@ fn marked(
             continue;
         }
         // What a rail seems to cut off may be what another effect, or the fit, has taken away already.
-        let gain = if mark.rounding > 0.0 {
+        let gain = if effect.rounds() {
             (mark.variance / energy).min(1.0)
         } else {
             1.0 - there / left(&smooth).max(1e-300)

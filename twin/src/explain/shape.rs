@@ -167,7 +167,7 @@ fn misfit(
     let (index, size) = (0..taken.len())
         .map(|index| (index, taken[index].0))
         .filter(|(index, size)| *size >= CURVE * taken[*index].1)
-        // Steps that the readings show by themselves; noise makes a softer curve of them.
+        // Steps and ends that the readings show by themselves; noise makes a softer curve of them.
         .filter(|(index, _)| bench.mark(effect(*index)).is_none())
         .filter(|(index, _)| left > allowed(*index).max(accuracy))
         .min_by(|a, b| a.1.total_cmp(&b.1))?;

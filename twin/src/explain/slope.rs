@@ -13,6 +13,7 @@ use crate::problem::Base;
 /// What the model file says of the base is off by this many of its own standard uncertainties at most: beyond them it is no
 /// uncertainty but physics that was left out, and has a name.
 pub const BASE_OFF: f64 = 4.0;
+
 /// Whether a value of the base stands at that end, by how many of its standard uncertainties it is off.
 pub(super) fn at_base_end(deviations: f64) -> bool {
     deviations.abs() >= BASE_OFF * (1.0 - 1e-9)
@@ -132,32 +133,29 @@ impl Slope {
         }
     }
 
-    /// Leaves coordinates where they are: values beyond which nothing means anything (a knee at full charge) that would go there
-    /// (`at_ends` has the model, and which way each would go), and of the starts, by index and coordinate, those of which the readings in use do not tell: how an
-    /// operation began is no physics that another one could tell.
-    pub(super) fn keep(
-        &self,
-        at_ends: Option<(&Model, &DVector<f64>)>,
-        (normal, right): (&mut DMatrix<f64>, &mut DVector<f64>),
-        untold: impl Fn(usize, usize) -> bool,
-    ) {
-        for (k, coordinate) in self.coordinates.iter().enumerate() {
-            let stays = match *coordinate {
-                Coordinate::Value(m, p, _) => at_ends.is_some_and(|(model, outward)| {
-                    let member = &model.members[m];
-                    let (low, high) = member.effect.card().parameters[p].limits;
-                    let value = member.values[p];
-                    (value <= low && outward[k] < 0.0) || (value >= high && outward[k] > 0.0)
-                }),
-                Coordinate::SocShift(start) => untold(start, k),
-                _ => false,
-            };
-            if stays {
-                normal.row_mut(k).fill(0.0);
-                normal.column_mut(k).fill(0.0);
-                right[k] = 0.0;
+    /// Coordinates of a model's values that stand at a limit beyond which nothing means anything (a knee at full charge) and would
+    /// go there.
+    pub(super) fn at_ends(&self, model: &Model, outward: &DVector<f64>) -> Vec<usize> {
+        let at_end = |k: &usize| match self.coordinates[*k] {
+            Coordinate::Value(m, p, _) => {
+                let member = &model.members[m];
+                let (low, high) = member.effect.card().parameters[p].limits;
+                let value = member.values[p];
+                (value <= low && outward[*k] < 0.0) || (value >= high && outward[*k] > 0.0)
             }
-        }
+            _ => false,
+        };
+        (0..self.len()).filter(at_end).collect()
+    }
+
+    /// Coordinates of the starts, each with the index of its start, that are not told: how an operation began is no physics that
+    /// another one could tell.
+    pub(super) fn starts(&self, untold: impl Fn(usize, usize) -> bool) -> Vec<usize> {
+        let is_untold = |k: &usize| match self.coordinates[*k] {
+            Coordinate::SocShift(start) => untold(start, *k),
+            _ => false,
+        };
+        (0..self.len()).filter(is_untold).collect()
     }
 
     /// Penalty of the base's nuisances at this model, and what it adds to the normal equations.

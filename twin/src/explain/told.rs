@@ -181,7 +181,8 @@ pub(super) fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> 
     }
 }
 
-/// The verdict in one sentence; `elsewhere` is what another start would do, and `vetoed` is what was taken back for a file that was never fitted.
+/// The verdict in one sentence; `elsewhere` is what another start would do, and `vetoed` is what was taken back for a file that was
+/// never fitted.
 pub(super) fn sentence(
     bench: &Workbench<'_>,
     selection: &Selection,
@@ -293,6 +294,11 @@ fn at_limit(nuisance: &Nuisance, base: &Base) -> bool {
         || ends(nuisance.resistance, base.resistance_sigma)
 }
 
+/// When an operation started, of several.
+pub(super) fn start_of(operation: usize) -> String {
+    format!("at the start of operation {}", operation + 1)
+}
+
 /// By what the battery as designed differs, if by more than [`TOLD_PERCENT`].
 fn base_differs(nuisance: &Nuisance) -> Option<String> {
     let by = |share: f64, what: &str, unit: &str| {
@@ -301,15 +307,12 @@ fn base_differs(nuisance: &Nuisance) -> Option<String> {
         (percent.abs() >= TOLD_PERCENT)
             .then(|| format!("{what} {} {unit} {way}", short(percent.abs())))
     };
-    let shifts = nuisance.soc_shift.iter().copied().enumerate();
-    let (operation, shift) = shifts
-        .max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))
-        .unwrap_or_default();
+    let (operation, shift) = nuisance.largest_soc_shift().unwrap_or_default();
     let start = match nuisance.soc_shift.len() {
         0 | 1 => "the state of charge at the start".to_owned(),
         count => format!(
-            "the state of charge at the start of operation {}, the most of {count},",
-            operation + 1
+            "the state of charge {}, the most of {count},",
+            start_of(operation)
         ),
     };
     let found: Vec<String> = [

@@ -9,7 +9,8 @@ use super::slope::change;
 use super::told::short;
 use super::workbench::{Member, Workbench};
 use super::{Held, intervals, jumps, rms};
-use crate::problem::Coloured;
+use crate::effects::scene::range_changes;
+use crate::problem::{Base, Coloured};
 use crate::report::data::Verdict;
 
 /// Structure left beside the named effects makes the explanation a partial one from this share of the residual on.
@@ -239,8 +240,9 @@ pub(super) fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
             .model
             .members
             .iter()
+            .filter(|member| member.effect.rounds())
             .filter_map(|member| bench.mark(member.effect))
-            .map(|mark| mark.rounding)
+            .map(|mark| mark.variance)
             .sum();
         2.0 * grid * count
     }
@@ -248,12 +250,10 @@ pub(super) fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
 
 /// Readings that no stated noise makes.
 struct Strays {
-    count: usize,
+    rows: Vec<usize>,
     /// The largest of them, in the view's unit, and its time in s.
     largest: f64,
     at_s: f64,
-    /// Whether all are at a change of range, and not by chance.
-    at_changes: bool,
     /// Whether they are the mismatch: most of it, or so many in a row that it is no slip of the log.
     decide: bool,
 }
@@ -261,7 +261,7 @@ struct Strays {
 impl Strays {
     /// How many there are, as the beginning of a sentence.
     fn counted(&self) -> String {
-        match self.count {
+        match self.rows.len() {
             1 => "one reading is".to_owned(),
             count => format!("{count} readings are"),
         }
@@ -295,24 +295,22 @@ fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
         .map(<[usize]>::len)
         .fold(0, usize::max);
     Some(Strays {
-        count: rows.len(),
         largest: residual[largest].abs(),
         at_s: bench.t_s[largest],
-        at_changes: at_changes(bench, &rows),
         decide: (rows.len() >= least && energy > share * all) || (stated && in_a_row >= IN_A_ROW),
+        rows,
     })
 }
 
-/// Whether readings are all next to a change of the range flag, and would hardly be by chance.
+/// Whether readings are all next to a change of range, and would hardly be by chance.
 fn at_changes(bench: &Workbench<'_>, rows: &[usize]) -> bool {
-    let drive = &bench.problem.drive;
-    let Some(flag) = &drive.range_high else {
+    let Base::Sensor(sensor) = &bench.problem.base else {
         return false;
     };
-    let high = |row: usize| flag[row] > 0.5;
-    let mut changes_s: Vec<f64> = (1..flag.len())
-        .filter(|&row| high(row) != high(row - 1))
-        .map(|row| drive.t_s[row])
+    let drive = &bench.problem.drive;
+    let changes = range_changes(drive, Some(sensor)).into_iter();
+    let mut changes_s: Vec<f64> = changes
+        .map(|change| drive.t_s[change.row] - change.since_s)
         .collect();
     changes_s.sort_unstable_by(f64::total_cmp);
     let next_to_s = 1.5 * bench.scale.step_s;
@@ -335,10 +333,10 @@ pub(super) fn slips(read: &Workbench<'_>, shown: &Fit, verdict: Verdict) -> Opti
         return None;
     }
     let strays = strays(read, &shown.residual)?;
-    let why = if strays.at_changes {
+    let why = if at_changes(read, &strays.rows) {
         "at changes of range, as range-handover does, but too few here to name it"
     } else {
-        why_astray(strays.count as f64 / read.len() as f64, verdict)?
+        why_astray(strays.rows.len() as f64 / read.len() as f64, verdict)?
     };
     let of_what = if shown.model.members.is_empty() {
         ""

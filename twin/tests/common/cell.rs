@@ -7,7 +7,10 @@ use std::fs;
 
 use serde_json::Value;
 
-use crate::{command::twin, common::noise};
+use crate::{
+    command::{EXPLAIN, twin},
+    common::noise,
+};
 
 pub const ROWS: usize = 2400;
 pub const FINE: usize = 10;
@@ -88,15 +91,7 @@ pub fn said(model: &str, fitted: &str, other: Option<&str>) -> Value {
     let write = |name: &str, text: &str| fs::write(folder.join(name), text).unwrap();
     write("m.toml", model);
     write("r.csv", fitted);
-    let mut arguments = vec![
-        "explain",
-        "--model",
-        "m.toml",
-        "--recording",
-        "r.csv",
-        "--out",
-        "out",
-    ];
+    let mut arguments = EXPLAIN.to_vec();
     if let Some(other) = other {
         write("h.csv", other);
         arguments.extend(["--holdout", "h.csv"]);

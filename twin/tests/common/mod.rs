@@ -3,7 +3,7 @@
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 use twin::explain::{Options, explain};
-use twin::problem::Problem;
+use twin::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
 use twin::report::data::Report;
 
 /// White noise of a standard deviation, in its unit.
@@ -15,6 +15,29 @@ pub fn noise(seed: u64, deviation: f64) -> impl FnMut() -> f64 {
             .map(|_| f64::from(random.next_u32()) / f64::from(u32::MAX))
             .sum();
         deviation * (sum - 6.0)
+    }
+}
+
+/// Readings of a sensor beside its current in A, at the same instants in s, under a design that states the noise alone.
+#[allow(dead_code, reason = "not every test has a sensor")]
+pub fn sensor(t_s: Vec<f64>, current_a: Vec<f64>, reading_a: Vec<f64>, noise_a: f64) -> Problem {
+    Problem {
+        view: View::Sensor,
+        name: "i_meas_a".into(),
+        unit: "A".into(),
+        drive: Drive {
+            segments: std::iter::once(0..t_s.len()).collect(),
+            continues: vec![false],
+            t_s: t_s.clone().into(),
+            reference: current_a.into(),
+            ..Drive::default()
+        },
+        observed: Observed::with_drive(t_s, reading_a),
+        base: Base::Sensor(SensorBase::default()),
+        modelled: Vec::new(),
+        noise: noise_a,
+        coloured: Coloured::default(),
+        accuracy: Accuracy::default(),
     }
 }
 
