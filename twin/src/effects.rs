@@ -290,6 +290,12 @@ pub trait Effect: Sync {
         None
     }
 
+    /// Values that do the same at evenly spaced rows but for how much they do: with a period (the first of them) that fits into the
+    /// time between two rows by so many turns more. `None`: rows, however they are spaced, tell the values.
+    fn alias(&self, _values: &[f64], _scale: &Scale, _turns: f64) -> Option<Vec<f64>> {
+        None
+    }
+
     /// Number of independent values among which the best is chosen without any of them being near another (periods, each a line
     /// of its own in noise): 1 for a value that is followed from a start.
     fn choices(&self, _scale: &Scale) -> f64 {

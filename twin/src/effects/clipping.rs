@@ -112,13 +112,15 @@ impl Effect for Clipping {
 const STAY: usize = 5;
 /// Of the readings that should be larger than the middle one of them, this share is there as well.
 const NEARLY_ALL: f64 = 0.9;
+/// Levels next to the end that tell how finely readings are written there.
+const NEXT: usize = 100;
 /// What is cut off of the middle one of them, in spreads of the mismatch.
 const CUT_OFF: f64 = 3.0;
 
 /// An upper end at which readings stay while the simulation goes on.
 struct Rail {
     at: f64,
-    /// Half of the least by which two readings differ.
+    /// Half of the least by which two readings near it differ.
     within: f64,
     /// Mean square of what it takes from the simulation.
     variance: f64,
@@ -156,10 +158,13 @@ fn rail(observed: impl Iterator<Item = f64>, predicted: impl Iterator<Item = f64
         return None;
     }
     let taken: f64 = rows.iter().map(|(_, p)| (p - at).max(0.0).powi(2)).sum();
+    // Large readings may be written more coarsely than small ones.
     let mut values: Vec<f64> = rows.iter().map(|(y, _)| *y).collect();
-    values.sort_unstable_by(f64::total_cmp);
-    let steps = values.windows(2).map(|pair| pair[1] - pair[0]);
-    let least = steps.filter(|step| *step > 0.0).reduce(f64::min)?;
+    values.sort_unstable_by(|a, b| b.total_cmp(a));
+    values.dedup();
+    values.truncate(NEXT);
+    let steps = values.windows(2).map(|pair| pair[0] - pair[1]);
+    let least = steps.reduce(f64::min)?;
     Some(Rail {
         at,
         within: 0.5 * least,
@@ -192,6 +197,22 @@ mod tests {
         assert!(rail.variance > 1.0 && rail.variance < 100.0);
         let (y, p): (Vec<f64>, Vec<f64>) = rows().map(|(y, p)| (-y.max(-80.0), -p)).unzip();
         assert_eq!(super::rail(y.into_iter(), p.into_iter()).unwrap().at, 80.0);
+    }
+
+    #[test]
+    fn a_rail_is_known_to_the_digits_that_are_written_there() {
+        const RAIL: f64 = 190.123_456;
+        // Seven digits: six behind the point below ten, four above a hundred.
+        let written = |y: f64| {
+            let size = 1e6 / 10_f64.powf(y.abs().log10().floor());
+            (y * size).round() / size
+        };
+        let (y, p): (Vec<f64>, Vec<f64>) = rows()
+            .map(|(y, p)| (written((2.2 * y).min(RAIL)), 2.2 * p))
+            .unzip();
+        let rail = rail(y.into_iter(), p.into_iter()).unwrap();
+        assert!(rail.at != RAIL && (rail.at - RAIL).abs() <= rail.within);
+        assert!(rail.within < 0.05, "{}", rail.within);
     }
 
     #[test]

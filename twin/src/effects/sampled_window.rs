@@ -104,15 +104,21 @@ impl Effect for SampledWindow {
             let duty = (length / period).min(1.0);
             near.push(vec![period, duty, phase + length + later - duty * period]);
         }
-        // Another period by which readings are as old at their rows.
-        let age = (-(phase / period + duty)).rem_euclid(1.0);
-        for rate in [1.0, -1.0].map(|turns| 1.0 / period + turns / scale.even_s) {
-            if rate > 0.0 {
-                let mean = 0.5 * period * (1.0 + duty);
-                near.push(seen(1.0 / rate, mean, age));
-            }
-        }
+        near.extend(
+            [1.0, -1.0]
+                .map(|turns| self.alias(values, scale, turns))
+                .into_iter()
+                .flatten(),
+        );
         Some(near)
+    }
+
+    /// Readings are as old at their rows, and as late in the mean.
+    fn alias(&self, values: &[f64], scale: &Scale, turns: f64) -> Option<Vec<f64>> {
+        let (period, duty, phase) = (values[0], values[1], values[2]);
+        let age = (-(phase / period + duty)).rem_euclid(1.0);
+        let rate = 1.0 / period + turns / scale.even_s;
+        (rate > 0.0).then(|| seen(1.0 / rate, 0.5 * period * (1.0 + duty), age))
     }
 
     fn turn(&self, values: &[f64]) -> Option<f64> {

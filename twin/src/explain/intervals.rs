@@ -15,7 +15,8 @@
 //! Where the loss has a kink in a value (an effect says so, [`crate::effects::Effect::kinked`]) or jumps with it, neither holds:
 //! the value is moved, the others are fitted again, and the interval ends where the loss has risen by what bounds 95 %
 //! (profile likelihood), with as many observations as the noise's memory leaves (Rao and Scott's correction). Rows on which it
-//! jumps count by how far they go to and fro: noise ahead of a threshold carries them over it both ways.
+//! jumps count by how far they go to and fro: noise ahead of a threshold carries them over it both ways. Of a period that evenly spaced
+//! rows do not tell from its aliases the interval has them all.
 
 use std::ops::Range;
 
@@ -25,7 +26,7 @@ use super::fit::{Fit, fit as refit};
 use super::normal::{dot, normal, solve};
 use super::robust::{huber, loss, weights};
 use super::slope::{Slope, change, rounds};
-use super::workbench::{Model, Workbench};
+use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Parameter, Search};
 
 /// 97.5th percentile of the normal distribution.
@@ -46,6 +47,8 @@ const NOISE_ALONE: f64 = 1.1;
 const LAGS: usize = 16;
 /// Steps to each side when the end of a profile is looked for.
 const OUTWARD: usize = 40;
+/// Aliases of a period that are asked to each side.
+const ALIASES: u32 = 100;
 /// Halvings that narrow the end down.
 const HALVINGS: usize = 7;
 
@@ -341,12 +344,14 @@ fn memories(
 pub fn intervals(bench: &Workbench<'_>, fit: &Fit, beside: f64) -> Vec<Vec<[f64; 2]>> {
     let slope = fit.slope(bench);
     let certainty = certainty(bench, fit, &slope, beside);
+    let other_physics = 0.5 * beside / (fit.sigma * fit.sigma);
     fit.model
         .members
         .iter()
         .enumerate()
         .map(|(m, member)| {
             let parameters = member.effect.card().parameters;
+            let aliases = aliases(bench, fit, m, RISE + other_physics);
             parameters
                 .iter()
                 .enumerate()
@@ -362,7 +367,7 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit, beside: f64) -> Vec<Vec<[f64;
                         }
                         let times = at.map_or(1.0, |k| certainty.inflation[k]);
                         let half = at.map(|k| certainty.half[k]);
-                        let rise = RISE * times + 0.5 * beside / (fit.sigma * fit.sigma);
+                        let rise = RISE * times + other_physics;
                         // Readings that stay at a level all fall on one step of the converter.
                         let by_step = if member.effect.level(p) {
                             0.5 * bench.scale.quantum
@@ -371,7 +376,9 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit, beside: f64) -> Vec<Vec<[f64;
                         };
                         return [-1.0, 1.0].map(|sign| {
                             let end = profile(bench, fit, (m, p), parameter, sign, rise, half);
-                            value + sign * (end - value).hypot(by_step)
+                            let end = value + sign * (end - value).hypot(by_step);
+                            let others = aliases.iter().map(|values| values[p]);
+                            others.fold(end, |end, other| sign * (sign * end).max(sign * other))
                         });
                     }
                     let Some(k) = at else {
@@ -391,6 +398,47 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit, beside: f64) -> Vec<Vec<[f64;
         .collect()
 }
 
+/// Whether the loss of a residual has risen by more than what bounds a 95 % interval.
+fn excluded(fit: &Fit, rise: f64) -> impl Fn(&[f64]) -> bool {
+    // What is left may be louder or quieter than the spread that the loss is told in.
+    let here = loss(&fit.residual, fit.sigma);
+    let loudness = 2.0 * here / fit.residual.len().max(1) as f64;
+    let limit = here + rise * loudness.max(0.1);
+    move |residual| {
+        let there = loss(residual, fit.sigma);
+        let jumped = || -> f64 {
+            let rows = fit.residual.iter().zip(residual);
+            rows.map(|(best, moved)| huber(moved / fit.sigma) - huber(best / fit.sigma))
+                .filter(|jump| jump.abs() > JUMP)
+                .map(|jump| jump * jump)
+                .sum()
+        };
+        there > limit && there > here + CHANCE * jumped().sqrt()
+    }
+}
+
+/// Values of a member that rows so far apart do not tell from its own, everything else fitted again: to each side until one is told.
+fn aliases(bench: &Workbench<'_>, fit: &Fit, member: usize, rise: f64) -> Vec<Vec<f64>> {
+    let Member { effect, values } = &fit.model.members[member];
+    let excluded = excluded(fit, rise);
+    let side = |sign: f64| {
+        let alias = |turns| effect.alias(values, &bench.scale, sign * f64::from(turns));
+        let refitted = |values| {
+            let mut model = fit.model.clone();
+            model.members[member].values = values;
+            model.held = Some((member, 0));
+            refit(bench, &model, None)
+        };
+        (1..=ALIASES)
+            .map_while(alias)
+            .map(refitted)
+            .take_while(|there| !excluded(&there.residual))
+            .map(|there| there.model.members[member].values.clone())
+            .collect::<Vec<_>>()
+    };
+    [side(-1.0), side(1.0)].concat()
+}
+
 /// How far a value can go to one side before the loss, everything else fitted again, has risen by what bounds a 95 % interval.
 fn profile(
     bench: &Workbench<'_>,
@@ -405,21 +453,7 @@ fn profile(
     let (low, high) = fit.model.members[member]
         .effect
         .bounds(parameter, &bench.scale);
-    // What is left may be louder or quieter than the spread that the loss is told in.
-    let here = loss(&fit.residual, fit.sigma);
-    let loudness = 2.0 * here / fit.residual.len().max(1) as f64;
-    let limit = here + rise * loudness.max(0.1);
-    let excluded = |residual: &[f64]| {
-        let there = loss(residual, fit.sigma);
-        let jumped = || -> f64 {
-            let rows = fit.residual.iter().zip(residual);
-            rows.map(|(best, moved)| huber(moved / fit.sigma) - huber(best / fit.sigma))
-                .filter(|jump| jump.abs() > JUMP)
-                .map(|jump| jump * jump)
-                .sum()
-        };
-        there > limit && there > here + CHANCE * jumped().sqrt()
-    };
+    let excluded = excluded(fit, rise);
     let risen = |there: f64| {
         let mut model = fit.model.clone();
         model.members[member].values[parameter] = there;
@@ -482,7 +516,6 @@ fn profile(
 mod tests {
     use super::*;
     use crate::effects::find;
-    use crate::explain::workbench::Member;
     use crate::problem::{Base, Coloured, Drive, Observed, Problem, SensorBase, View};
     use rand_chacha::ChaCha8Rng;
     use rand_chacha::rand_core::SeedableRng as _;
@@ -653,6 +686,46 @@ mod tests {
     fn a_rail_is_known_to_half_a_step_of_the_converter() {
         let found = coverage_at_the_end("clipping", &[97.3, -2400.0], 1.2);
         assert!(found > 0.86, "{found}");
+    }
+
+    /// A period of which many fit in between two rows: rows tell its beat with them, and hardly how many.
+    #[test]
+    fn a_period_between_two_rows_is_known_to_its_aliases() {
+        const RECORDINGS: u64 = 20;
+        let [period_s, duty] = [0.004_1, 0.6];
+        let window_a = |t_s: f64| {
+            let from_s = ((t_s - duty * period_s) / period_s).floor() * period_s;
+            let parts = (0..8).map(|k| from_s + duty * period_s * (f64::from(k) + 0.5) / 8.0);
+            parts.map(|t_s| current_a(t_s.max(0.0))).sum::<f64>() / 8.0
+        };
+        let (mut covered, mut more) = ([0, 0], 0);
+        for seed in 0..RECORDINGS {
+            let mut problem = problem(seed, WHITE, true, 0.0);
+            let mut random = ChaCha8Rng::seed_from_u64(RECORDINGS + seed);
+            let readings = problem.observed.value.iter_mut().zip(&problem.observed.t_s);
+            for (value, t_s) in readings {
+                let noise: f64 = StandardNormal.sample(&mut random);
+                *value = window_a(*t_s) + NOISE_A * noise;
+            }
+            let bench = Workbench::new(&problem, &[]);
+            let model = Model {
+                members: vec![Member {
+                    effect: find("sampled-window").unwrap(),
+                    values: vec![period_s, duty, 0.0],
+                }],
+                ..Model::default()
+            };
+            let fit = refit(&bench, &model, None);
+            let found = &intervals(&bench, &fit, 0.0)[0];
+            for (covered, (truth, [low, high])) in
+                covered.iter_mut().zip([period_s, duty].iter().zip(found))
+            {
+                *covered += u32::from((low..=high).contains(&truth));
+            }
+            more += u32::from(found[0][1] - found[0][0] > 0.02 * period_s);
+        }
+        assert!(covered.iter().all(|covered| *covered >= 17), "{covered:?}");
+        assert!(more >= 10, "{more}");
     }
 
     #[test]
