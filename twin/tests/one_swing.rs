@@ -134,3 +134,40 @@ fn a_current_that_stays_at_its_highest_value_is_no_rail() {
         );
     }
 }
+
+#[test]
+fn what_only_the_last_readings_show_is_held_out_too() {
+    // As many as between two blocks are held out in neither.
+    const LAST: usize = 8;
+    for seed in 0..4 {
+        let mut current = current(seed);
+        let mut noise = noise(seed + 100, NOISE_A);
+        let high = |row: usize| row >= ROWS - LAST;
+        // The swing is beyond what these sensors are asked about.
+        for (row, i) in current.iter_mut().enumerate() {
+            *i = if high(row) {
+                80.0 + 7.0 * (row % 4) as f64
+            } else {
+                0.5 * i.clamp(-100.0, 100.0)
+            };
+        }
+        let read = |(row, i): (usize, &f64)| if high(row) { i + 20.0 } else { *i } + noise();
+        let value = current.iter().enumerate().map(read).collect();
+        let t_s = (0..ROWS).map(|row| row as f64 * STEP_S).collect();
+        let mut problem = sensor(t_s, current, value, NOISE_A);
+        let flags: Vec<f64> = (0..ROWS)
+            .map(|row| f64::from(u8::from(high(row))))
+            .collect();
+        problem.drive.range_high = Some(flags.into());
+        let report = said(problem, seed, &[]);
+        assert!(
+            report
+                .effects
+                .iter()
+                .any(|effect| effect.id == "range-mismatch"),
+            "{seed}: {} {:#?}",
+            report.summary,
+            report.decisions
+        );
+    }
+}

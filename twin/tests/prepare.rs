@@ -236,6 +236,19 @@ fn clipping_and_a_dead_band_are_no_holding() {
 }
 
 #[test]
+fn a_window_that_is_read_in_steps_with_noise_is_no_holding() {
+    // A mean that is new each 0.37 s; noise takes the reading a step up or down from row to row.
+    let rows = (0..1000).map(|k| {
+        let t = f64::from(k) * 0.1;
+        let noise = 0.6 * (12.9898 * f64::from(k * k % 977)).sin();
+        let value = 40.0 * current((t / 0.37).floor() * 0.37) + noise;
+        vec![t, 40.0 * current(t), value.round()]
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    assert_eq!(problem.observed.valid_rows(), 1000, "{remarks:?}");
+}
+
+#[test]
 fn rows_of_their_own_are_not_interpolated() {
     // As a bus delivers them: either the one or the other.
     let rows = (0..400).map(|k| {

@@ -35,7 +35,8 @@ pub struct Entry {
     pub member: Member,
     /// Squared error that it removes from held-out blocks, as a share of all of it.
     pub gain: f64,
-    /// The same of the error with all of its outliers: what acts in few readings shows there.
+    /// Share that it removes from all of the error with its outliers, nothing held out: what acts in few readings, all in one block,
+    /// shows there and nowhere else.
     pub raw_gain: f64,
     /// Loss of the simulation with these very values.
     pub loss: f64,
@@ -225,7 +226,7 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
                 blocks.collect()
             };
             let rights = products(&residual);
-            let raw_gain = folds.gain(&products(&whole)) / dot(&whole, &whole).max(1e-300);
+            let raw_gain = folds.taken(&products(&whole)) / dot(&whole, &whole).max(1e-300);
             Entry {
                 member: Member {
                     effect: signature.effect,
@@ -373,30 +374,39 @@ impl Folds {
         Self { grams, others }
     }
 
-    /// Factors of the columns from all blocks; `rights` as in [`Folds::gain`].
-    fn factors(&self, rights: &[f64]) -> Vec<f64> {
+    /// Sum of all blocks' products.
+    fn all(&self, rights: &[f64]) -> DVector<f64> {
         let size = self.grams.first().map_or(0, DMatrix::nrows);
-        let mut gram = DMatrix::zeros(size, size);
-        let mut factors = DVector::<f64>::zeros(size);
-        for (one, right) in self.grams.iter().zip(rights.chunks_exact(size.max(1))) {
-            gram += one;
-            for (factor, right) in factors.iter_mut().zip(right) {
-                *factor += right;
-            }
-        }
-        Solver::new(&gram, 1e-9).solve(&mut factors);
-        factors.iter().copied().collect()
-    }
-
-    /// Σ over blocks of 2·βᵀs − βᵀGβ with β from the other blocks; `rights` are the products s, block by block.
-    pub fn gain(&self, rights: &[f64]) -> f64 {
-        let size = self.grams.first().map_or(0, DMatrix::nrows);
-        let mut all = DVector::<f64>::zeros(size);
+        let mut all = DVector::zeros(size);
         for right in rights.chunks_exact(size.max(1)) {
             for (all, right) in all.iter_mut().zip(right) {
                 *all += right;
             }
         }
+        all
+    }
+
+    /// Factors of the columns from all blocks; `rights` as in [`Folds::gain`].
+    fn factors(&self, rights: &[f64]) -> DVector<f64> {
+        let mut factors = self.all(rights);
+        let size = factors.len();
+        let gram = self
+            .grams
+            .iter()
+            .fold(DMatrix::zeros(size, size), |sum, gram| sum + gram);
+        Solver::new(&gram, 1e-9).solve(&mut factors);
+        factors
+    }
+
+    /// What the columns take with factors from all blocks; `rights` as in [`Folds::gain`].
+    fn taken(&self, rights: &[f64]) -> f64 {
+        self.factors(rights).dot(&self.all(rights))
+    }
+
+    /// Σ over blocks of 2·βᵀs − βᵀGβ with β from the other blocks; `rights` are the products s, block by block.
+    pub fn gain(&self, rights: &[f64]) -> f64 {
+        let all = self.all(rights);
+        let size = all.len();
         let mut beta = DVector::<f64>::zeros(size);
         let mut gain = 0.0;
         for ((gram, others), right) in self

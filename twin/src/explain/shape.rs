@@ -124,6 +124,15 @@ pub fn withdraw(
     }
 }
 
+/// Energy that so many columns take of the stated noise with a memory, on average: over T it has some T/2τ independent values. Moved in
+/// time, as a placebo is, few of them look as little like the columns as chance has it.
+fn of_noise(bench: &Workbench<'_>, columns: usize) -> f64 {
+    let noise = bench.problem.coloured;
+    let independent = bench.scale.span_s / (2.0 * noise.tau_s).max(1e-9);
+    let share = (columns as f64 / independent.max(1.0)).min(1.0);
+    noise.rms.powi(2) * bench.len() as f64 * share
+}
+
 /// The smallest effect whose curve is not the recording's, and why.
 fn misfit(
     bench: &Workbench<'_>,
@@ -139,7 +148,7 @@ fn misfit(
     if missed.share <= CERTAIN * missed.placebo_most {
         return None;
     }
-    let left = missed.share * dot(&residual, &residual);
+    let left = missed.share * dot(&residual, &residual) - of_noise(bench, free.len());
     let known = bench.problem.accuracy;
     let accuracy: f64 = bench
         .plain
@@ -175,7 +184,7 @@ fn misfit(
         index,
         format!(
             "a curve of the current, but another one: a free curve departs from it by {} of its size (rms)",
-            percent((left / size).sqrt())
+            percent((left.max(0.0) / size).sqrt())
         ),
     ))
 }

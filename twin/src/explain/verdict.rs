@@ -10,7 +10,7 @@ use super::told::short;
 use super::workbench::{Member, Workbench};
 use super::{Held, intervals, jumps, rms};
 use crate::effects::scene::range_changes;
-use crate::problem::{Base, Coloured};
+use crate::problem::{Accuracy, Base, Coloured};
 use crate::report::data::Verdict;
 
 /// Structure left beside the named effects makes the explanation a partial one from this share of the residual on.
@@ -366,10 +366,19 @@ fn why_astray(share: f64, verdict: Verdict) -> Option<&'static str> {
     }
 }
 
-/// The least energy that the design lets be left: what is unavoidable, or the reference's own zero and the readings' steps.
+/// The least energy that the design lets be left: what is unavoidable, or what the reference's own zero, the readings' steps and
+/// moments that may all be off together make of readings. (What a gain that is off makes, the fit takes.)
 fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
-    let zero = bench.problem.accuracy.zero + 0.5 * bench.problem.observed.grid;
-    unavoidable.max(zero * zero * bench.len() as f64)
+    let stated = Accuracy {
+        gain: 0.0,
+        scatter: 0.0,
+        ..bench.problem.accuracy
+    };
+    let grid = 0.5 * bench.problem.observed.grid;
+    let together: f64 = (0..bench.len())
+        .map(|row| (stated.at(0.0, bench.slope_per_s(row)) + grid).powi(2))
+        .sum();
+    unavoidable.max(together)
 }
 
 /// By how much the mean square of the stated noise that has a memory, in the view's unit squared, can be above the stated one by

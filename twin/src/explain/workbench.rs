@@ -336,7 +336,7 @@ impl<'a> Workbench<'a> {
     }
 
     /// How fast the simulation as designed changes up to a row, in the view's unit per second; 0 at the first one.
-    fn slope_per_s(&self, row: usize) -> f64 {
+    pub(super) fn slope_per_s(&self, row: usize) -> f64 {
         let Some(before) = row.checked_sub(1) else {
             return 0.0;
         };
@@ -718,8 +718,9 @@ fn blocks(rows: &[usize]) -> Vec<Range<usize>> {
         .map(|block| {
             let start = rows.len() * block / count;
             let end = rows.len() * (block + 1) / count;
-            let guard = ((end - start) as f64 * GUARD) as usize;
-            start..end - guard
+            // Nothing comes after the last one.
+            let guard = if block + 1 < count { GUARD } else { 0.0 };
+            start..end - ((end - start) as f64 * guard) as usize
         })
         .collect()
 }

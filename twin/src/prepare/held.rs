@@ -8,6 +8,8 @@ const HELD_SHARE: f64 = 0.2;
 /// A value is measured again after this many intervals at the latest: half an interval is what the time of either may be off by. A
 /// little less, for where rows are a whole part of the interval, rounding of the time stamps is not to decide.
 const AGAIN: f64 = 1.5 - 1e-4;
+/// Of readings that come again up to this share come a third time by chance.
+const BY_CHANCE: f64 = 0.1;
 /// The reference moves if it changes by this many of the sensor's own steps.
 const MOVING_STEPS: f64 = 2.0;
 
@@ -64,7 +66,8 @@ pub fn freshness(
             true
         }
     };
-    let (mut moved, mut repeated) = (0_usize, 0_usize);
+    let (mut moved, mut repeated, mut at_once) = (0_usize, 0_usize, 0_usize);
+    let mut last_repeat = None;
     for (before, after) in pairs() {
         let now = value[before];
         let special = now == low || now == high || Some(now) == favourite;
@@ -72,13 +75,18 @@ pub fn freshness(
             continue;
         }
         moved += 1;
-        repeated += usize::from(value[before] == value[after]);
+        if value[before] == value[after] {
+            repeated += 1;
+            at_once += usize::from(last_repeat == Some(before));
+            last_repeat = Some(after);
+        }
     }
     let mut apart: Vec<f64> = pairs()
         .map(|(before, after)| t_s[after] - t_s[before])
         .collect();
-    let is_stated = median(&mut apart).is_some_and(|step_s| step_s < 0.75 * stated_s);
+    let step_s = median(&mut apart).unwrap_or_default();
     drop(apart);
+    let is_stated = step_s > 0.0 && step_s < 0.75 * stated_s;
     let is_seen = moved >= 10 && repeated as f64 >= HELD_SHARE * moved as f64;
     if !is_stated && !is_seen {
         return Freshness::all(rows);
@@ -105,7 +113,12 @@ pub fn freshness(
     let interval_s = if is_stated {
         stated_s
     } else {
-        median(&mut spans).unwrap_or(0.0)
+        let interval_s = median(&mut spans).unwrap_or(0.0);
+        // Most change from row to row, and others stay for several rows: no sensor has such an interval.
+        if interval_s < AGAIN * step_s && at_once as f64 > BY_CHANCE * repeated as f64 {
+            return Freshness::all(rows);
+        }
+        interval_s
     };
     // A value that stays longer was measured again and came out the same: once for each interval.
     let mut last_fresh = f64::NEG_INFINITY;
