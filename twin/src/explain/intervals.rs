@@ -47,8 +47,8 @@ const NOISE_ALONE: f64 = 1.1;
 const LAGS: usize = 16;
 /// Steps to each side when the end of a profile is looked for.
 const OUTWARD: usize = 40;
-/// Aliases of a period that are asked to each side.
-const ALIASES: u32 = 100;
+/// Turns by which an alias is asked for at once.
+const MOST_TURNS: f64 = 4096.0;
 /// Halvings that narrow the end down.
 const HALVINGS: usize = 7;
 
@@ -417,26 +417,34 @@ fn excluded(fit: &Fit, rise: f64) -> impl Fn(&[f64]) -> bool {
     }
 }
 
-/// Values of a member that rows so far apart do not tell from its own, everything else fitted again: to each side until one is told.
+/// Values of a member that rows so far apart do not tell from its own, everything else fitted again: to each side as far as they go.
 fn aliases(bench: &Workbench<'_>, fit: &Fit, member: usize, rise: f64) -> Vec<Vec<f64>> {
     let Member { effect, values } = &fit.model.members[member];
     let excluded = excluded(fit, rise);
-    let side = |sign: f64| {
-        let alias = |turns| effect.alias(values, &bench.scale, sign * f64::from(turns));
-        let refitted = |values| {
-            let mut model = fit.model.clone();
-            model.members[member].values = values;
-            model.held = Some((member, 0));
-            refit(bench, &model, None)
-        };
-        (1..=ALIASES)
-            .map_while(alias)
-            .map(refitted)
-            .take_while(|there| !excluded(&there.residual))
-            .map(|there| there.model.members[member].values.clone())
-            .collect::<Vec<_>>()
+    // The values, so many turns away, if they are not told apart.
+    let untold = |turns: f64| {
+        let mut model = fit.model.clone();
+        model.members[member].values = effect.alias(values, &bench.scale, turns)?;
+        model.held = Some((member, 0));
+        let there = refit(bench, &model, None);
+        (!excluded(&there.residual)).then(|| there.model.members[member].values.clone())
     };
-    [side(-1.0), side(1.0)].concat()
+    let mut found = Vec::new();
+    for sign in [-1.0, 1.0] {
+        // Twice as far each time, and back by halves.
+        let (mut inside, mut step, mut onward) = (0.0, 1.0, true);
+        while (1.0..=MOST_TURNS).contains(&step) {
+            match untold(sign * (inside + step)) {
+                Some(values) => {
+                    found.push(values);
+                    inside += step;
+                }
+                None => onward = false,
+            }
+            step *= if onward { 2.0 } else { 0.5 };
+        }
+    }
+    found
 }
 
 /// How far a value can go to one side before the loss, everything else fitted again, has risen by what bounds a 95 % interval.
