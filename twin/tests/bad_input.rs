@@ -7,7 +7,7 @@ mod command;
 
 use std::{fs, path::Path, process::Command};
 
-use command::{EXPLAIN, twin};
+use command::{EXPLAIN, SIMULATE, twin};
 
 const PAIR: &str = "schema = 1\n[sensor]\n";
 
@@ -271,18 +271,8 @@ fn the_proposed_mapping_is_taken() {
         + &rows(300, |t| format!("{t},{},{}", current(t), -current(t)));
     fs::write(folder.path().join("m.toml"), PAIR).unwrap();
     fs::write(folder.path().join("r.csv"), recording).unwrap();
-    let arguments = [
-        "simulate",
-        "--model",
-        "m.toml",
-        "--recording",
-        "r.csv",
-        "--out",
-        "s.csv",
-        "--map",
-        "i_meas_a=-i_meas_a",
-    ];
-    let output = twin(folder.path(), &arguments);
+    let map = ["--map", "i_meas_a=-i_meas_a"];
+    let output = twin(folder.path(), &[&SIMULATE[..], &map].concat());
     assert_eq!(output.status.code(), Some(0), "{output:?}");
 }
 

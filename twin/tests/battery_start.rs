@@ -11,7 +11,7 @@ mod common;
 use std::fs;
 
 use cell::{AS_DESIGNED, Cell, NOISE_V, log, model, names, open_circuit_v, operation, said};
-use command::twin;
+use command::{SIMULATE, twin};
 use common::noise;
 
 /// Cells with an effect that the design lacks.
@@ -84,16 +84,7 @@ fn a_simulation_begins_as_stated_unless_its_recording_begins_elsewhere() {
         let recorded = log(&[operation(AS_DESIGNED, begins, 0.002, 0, 5)]);
         fs::write(folder.join("r.csv"), recorded).unwrap();
         fs::write(folder.join("m.toml"), model("initial_soc = 0.9")).unwrap();
-        let arguments = [
-            "simulate",
-            "--model",
-            "m.toml",
-            "--recording",
-            "r.csv",
-            "--out",
-            "s.csv",
-        ];
-        let output = twin(folder, &arguments);
+        let output = twin(folder, &SIMULATE);
         assert_eq!(output.status.code(), Some(0));
         let said = String::from_utf8(output.stdout).unwrap();
         let read = |name: &str| {

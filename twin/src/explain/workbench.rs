@@ -126,7 +126,7 @@ pub struct Workbench<'a> {
     pub modelled: f64,
     /// Fits that were made: from which model to which, with spread and loss.
     known: Mutex<HashMap<Key, (Model, f64, f64)>>,
-    /// What the readings show by themselves, by effect: found once, for no simulation changes it.
+    /// What the readings show by themselves or beside the simulation as designed, by effect: found once.
     marks: Vec<(&'static str, Mark)>,
     /// Makes the stated noise white, with the readings after it.
     white: Option<(Whitening, Vec<f64>)>,

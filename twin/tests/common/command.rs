@@ -17,6 +17,18 @@ pub const EXPLAIN: [&str; 7] = [
     "out",
 ];
 
+/// What simulates a recording under a model.
+#[allow(dead_code, reason = "not every test simulates")]
+pub const SIMULATE: [&str; 7] = [
+    "simulate",
+    "--model",
+    "m.toml",
+    "--recording",
+    "r.csv",
+    "--out",
+    "s.csv",
+];
+
 /// Runs `twin` in a folder.
 pub fn twin(folder: &Path, arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_twin"))
