@@ -27,6 +27,10 @@ const EVALUATED: usize = 3600;
 const EXPLAINED: usize = 6000;
 /// Samples of a long one: three hours at 10 Hz.
 const LONG: usize = 108_000;
+/// Rows for each reading of a long one whose current bends between its rows.
+const FINER: usize = 5;
+/// Time constant of that current's steps, in s.
+const BLUNT_S: f64 = 0.8;
 /// Samples of a simulation.
 const SIMULATED: usize = 1_000_000;
 /// Noise of a reading, in A.
@@ -208,18 +212,63 @@ fn explain_6000_samples(bencher: Bencher<'_, '_>, name: &str) {
     });
 }
 
-#[divan::bench(args = [0, 1, 3], sample_count = 1, sample_size = 1)]
-fn explain_three_hours(bencher: Bencher<'_, '_>, concealed: usize) {
-    let effects: Effects = &[("offset", &[0.8]), ("gain", &[1.01]), ("delay", &[0.05])];
-    let problem = problem(LONG, View::Sensor, &effects[..concealed]);
+/// Effects of a long recording.
+const LONG_EFFECTS: Effects = &[("offset", &[0.8]), ("gain", &[1.01]), ("delay", &[0.05])];
+
+fn explain_all(bencher: Bencher<'_, '_>, problem: &Problem) {
     bencher.counter(ItemsCount::new(LONG)).bench_local(|| {
         explain(
-            black_box(std::slice::from_ref(&problem)),
+            black_box(std::slice::from_ref(problem)),
             &[],
             &Options::default(),
             &mut |_, _| {},
         )
     });
+}
+
+#[divan::bench(args = [0, 1, 3], sample_count = 1, sample_size = 1)]
+fn explain_three_hours(bencher: Bencher<'_, '_>, concealed: usize) {
+    let problem = problem(LONG, View::Sensor, &LONG_EFFECTS[..concealed]);
+    explain_all(bencher, &problem);
+}
+
+/// The same with steps that are low-passed, as a motor's current is: what flows between the rows is no straight line, and much looks
+/// like a delay.
+#[divan::bench(sample_count = 1, sample_size = 1)]
+fn explain_three_blunt_hours(bencher: Bencher<'_, '_>) {
+    let mut fine = problem(LONG * FINER, View::Sensor, &[]);
+    let step_s = 0.1 / FINER as f64;
+    fine.drive.t_s = (0..LONG * FINER).map(|row| row as f64 * step_s).collect();
+    // Steps of a reading's rows, each held over the finer ones.
+    let coarse = drive(LONG, 0.1).reference;
+    let mut now = coarse[0];
+    fine.drive.reference = (0..LONG * FINER)
+        .map(|row| {
+            now += (coarse[row / FINER] - now) * (1.0 - (-step_s / BLUNT_S).exp());
+            now
+        })
+        .collect();
+    fine.observed = Observed::with_drive(fine.drive.t_s.clone(), vec![0.0; LONG * FINER]);
+    let effects: Vec<(String, Vec<f64>)> = LONG_EFFECTS
+        .iter()
+        .map(|(id, values)| ((*id).to_owned(), values.to_vec()))
+        .collect();
+    let seen = twin::explain::predict(&fine, &effects);
+    let mut problem = problem(LONG, View::Sensor, &[]);
+    let mut random = ChaCha8Rng::seed_from_u64(2);
+    problem.drive.reference = fine
+        .drive
+        .reference
+        .iter()
+        .copied()
+        .step_by(FINER)
+        .collect();
+    problem.observed.value = seen
+        .into_iter()
+        .step_by(FINER)
+        .map(|value| value + problem.noise * noise(&mut random))
+        .collect();
+    explain_all(bencher, &problem);
 }
 
 #[divan::bench(args = ["dual range", "dual range, with charge", "closed loop"], sample_count = 5, sample_size = 1)]

@@ -77,7 +77,7 @@ pub(super) fn wavering(
     !refused.is_empty()
 }
 
-/// Takes effects out again whose values the recording does not tell; where others would do as well, the best of those whose
+/// Takes effects out again whose values the recording does not tell, or that ended where physics does; where others would do as well, the best of those whose
 /// values it does tell takes the place.
 pub(super) fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
     let mut refused: Vec<&'static str> = Vec::new();
@@ -90,7 +90,8 @@ pub(super) fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
                 .zip(&intervals)
                 .enumerate()
                 .find_map(|(index, (member, intervals))| {
-                    Some((index, untold(&bench.scale, member, intervals)?))
+                    let untold = untold(&bench.scale, member, intervals);
+                    Some((index, untold.or_else(|| ended(bench, member))?))
                 });
         let Some((index, why)) = found else {
             return;
@@ -108,6 +109,13 @@ pub(super) fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
             &|_| true,
         );
     }
+}
+
+/// Whether the last fit brought a value to the end of what is physics, where no effect is accepted; what readings show by
+/// themselves no fit has moved.
+fn ended(bench: &Workbench<'_>, member: &Member) -> Option<String> {
+    let shown = bench.shown(member).is_some();
+    (!shown).then(|| select::at_end(bench, member)).flatten()
 }
 
 /// Takes an effect out of the model, or puts the best of its equals of which something holds in its place.
