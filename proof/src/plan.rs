@@ -744,7 +744,7 @@ fn is_quick(planned: &Planned) -> bool {
     }
 }
 
-/// Added to the seeds below: with those themselves the tool was made, with 10 to 80 more it was judged and mended. What has been
+/// Added to the seeds below: with those themselves the tool was made, with 10 to 90 more it was judged and mended. What has been
 /// changed since these were first looked at is told in docs/proof/method.md.
 pub const SEEDS: u64 = 100;
 

@@ -13,7 +13,7 @@ use twin::explain::workbench::{Member, Model, Workbench};
 use twin::explain::{Options, explain};
 use twin::model::FrontEndKind;
 use twin::problem::{
-    Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, View,
+    Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, Series, View,
 };
 use twin::simulate::board::{Board, Pace};
 
@@ -44,6 +44,22 @@ fn noise(random: &mut ChaCha8Rng) -> f64 {
         - 6.0
 }
 
+/// Where the large range measures: beyond what the small one is designed for, in A.
+fn range_high(reference: &[f64]) -> Series {
+    reference
+        .iter()
+        .map(|i| f64::from(i.abs() > 53.33))
+        .collect()
+}
+
+/// Effects as a simulation takes them.
+fn owned(effects: &[(&str, &[f64])]) -> Vec<(String, Vec<f64>)> {
+    effects
+        .iter()
+        .map(|(id, values)| ((*id).to_owned(), values.to_vec()))
+        .collect()
+}
+
 /// A drive through discharge and charge, with steps and rests, and its surroundings.
 fn drive(rows: usize, step_s: f64) -> Drive {
     let mut random = ChaCha8Rng::seed_from_u64(1);
@@ -71,12 +87,7 @@ fn drive(rows: usize, step_s: f64) -> Drive {
             .collect()
     };
     Drive {
-        range_high: Some(
-            reference
-                .iter()
-                .map(|i: &f64| f64::from(i.abs() > 53.33))
-                .collect(),
-        ),
+        range_high: Some(range_high(&reference)),
         sensor_temperature_c: Some(slow(400.0).iter().map(|v| 25.0 + 12.0 * v).collect()),
         supply_v: Some(slow(150.0).iter().map(|v| 5.0 + 0.1 * v).collect()),
         cell_temperature_c: Some(slow(900.0).iter().map(|v| 22.0 + 6.0 * v).collect()),
@@ -124,12 +135,8 @@ fn problem(rows: usize, view: View, effects: &[(&str, &[f64])]) -> Problem {
         coloured: Coloured::default(),
         accuracy: Accuracy::default(),
     };
-    let effects: Vec<(String, Vec<f64>)> = effects
-        .iter()
-        .map(|(id, values)| ((*id).to_owned(), values.to_vec()))
-        .collect();
     let mut random = ChaCha8Rng::seed_from_u64(2);
-    problem.observed.value = twin::explain::predict(&problem, &effects)
+    problem.observed.value = twin::explain::predict(&problem, &owned(effects))
         .into_iter()
         .map(|value| value + problem.noise * noise(&mut random))
         .collect();
@@ -249,11 +256,7 @@ fn explain_three_blunt_hours(bencher: Bencher<'_, '_>) {
         })
         .collect();
     fine.observed = Observed::with_drive(fine.drive.t_s.clone(), vec![0.0; LONG * FINER]);
-    let effects: Vec<(String, Vec<f64>)> = LONG_EFFECTS
-        .iter()
-        .map(|(id, values)| ((*id).to_owned(), values.to_vec()))
-        .collect();
-    let seen = twin::explain::predict(&fine, &effects);
+    let seen = twin::explain::predict(&fine, &owned(LONG_EFFECTS));
     let mut problem = problem(LONG, View::Sensor, &[]);
     let mut random = ChaCha8Rng::seed_from_u64(2);
     problem.drive.reference = fine
@@ -263,6 +266,7 @@ fn explain_three_blunt_hours(bencher: Bencher<'_, '_>) {
         .copied()
         .step_by(FINER)
         .collect();
+    problem.drive.range_high = Some(range_high(&problem.drive.reference));
     problem.observed.value = seen
         .into_iter()
         .step_by(FINER)

@@ -414,25 +414,12 @@ fn files_that_are_not_there_and_effects_that_do_not_exist() {
         &refused(&files, &with(&["out", "--map", "i_ref_a=shunt"])),
         &["shunt"],
     );
-    let simulate = [
-        "simulate",
-        "--model",
-        "no.toml",
-        "--recording",
-        "r.csv",
-        "--out",
-        "s.csv",
-    ];
+    let with = |from: &str, to: &'static str| {
+        SIMULATE.map(|argument| if argument == from { to } else { argument })
+    };
+    let simulate = with("m.toml", "no.toml");
     says(&refused(&files, &simulate), &["no.toml", "no such file"]);
-    let simulate = [
-        "simulate",
-        "--model",
-        "m.toml",
-        "--recording",
-        "r.csv",
-        "--out",
-        "s.txt",
-    ];
+    let simulate = with("s.csv", "s.txt");
     says(&refused(&files, &simulate), &["s.txt", ".csv or .parquet"]);
 }
 

@@ -41,6 +41,7 @@ fn explained_without(seed: u64, without: &[&str], reading: impl Fn(f64) -> f64) 
     said(problem(seed, false, reading), seed, without)
 }
 
+/// The sensor's readings, under an ideal one as designed.
 fn problem(seed: u64, noise_before: bool, reading: impl Fn(f64) -> f64) -> Problem {
     let current = current(seed);
     let mut noise = noise(seed + 100, NOISE_A);

@@ -77,8 +77,8 @@ pub(super) fn wavering(
     !refused.is_empty()
 }
 
-/// Takes effects out again whose values the recording does not tell, or that ended where physics does; where others would do as well, the best of those whose
-/// values it does tell takes the place.
+/// Takes effects out again whose values the recording does not tell, or that ended where physics does; where others would do as
+/// well, the best of those whose values it does tell takes the place.
 pub(super) fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
     let mut refused: Vec<&'static str> = Vec::new();
     while !selection.named.is_empty() {
@@ -114,8 +114,10 @@ pub(super) fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
 /// Whether the last fit brought a value to the end of what is physics, where no effect is accepted; what readings show by
 /// themselves no fit has moved.
 fn ended(bench: &Workbench<'_>, member: &Member) -> Option<String> {
-    let shown = bench.shown(member).is_some();
-    (!shown).then(|| select::at_end(bench, member)).flatten()
+    match bench.shown(member) {
+        Some(_) => None,
+        None => select::at_end(bench, member),
+    }
 }
 
 /// Takes an effect out of the model, or puts the best of its equals of which something holds in its place.
