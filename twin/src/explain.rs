@@ -7,6 +7,7 @@
 //! `verdict` says what that makes, `elsewhere` whether another start would do the same, and `told` puts the report together.
 //! Nothing here knows a file or an effect by name.
 
+mod course;
 mod elsewhere;
 pub mod fit;
 pub mod flexible;
@@ -35,6 +36,7 @@ use crate::effects::chain::{Chain, Nuisance};
 use crate::effects::{Effect, find_with};
 use crate::problem::Problem;
 use crate::report::data::{Report, SignalReport, Unexplained, Verdict};
+use course::Course;
 use fit::Fit;
 use flexible::{Explainable, Features};
 use select::Selection;
@@ -155,68 +157,13 @@ fn rms(values: impl Iterator<Item = f64>) -> f64 {
     }
 }
 
-/// A signal with the files that were never fitted, as the reference goes from row to row: in straight lines, or smoothly.
-struct Course<'a> {
-    problem: Cow<'a, Problem>,
-    holdouts: Cow<'a, [Holdout]>,
-}
-
-impl Course<'_> {
-    /// The smooth one, if there may be one, and whether the rows alone tell that it is.
-    fn smooth(&self) -> Option<(Course<'static>, bool)> {
-        let (problem, told) = self.problem.smoothed()?;
-        let smooth = |holdout: &Holdout| Holdout {
-            file: holdout.file.clone(),
-            problems: holdout
-                .problems
-                .iter()
-                .map(Problem::with_smooth_reference)
-                .collect(),
-        };
-        let smooth = Course {
-            holdouts: self.holdouts.iter().map(smooth).collect(),
-            problem: Cow::Owned(problem),
-        };
-        Some((smooth, told))
-    }
-
-    /// Whether what was named on another course, fitted here, makes the loss smaller by so much: if not, to decide again is in vain.
-    /// Where nothing was named there is nothing to ask with.
-    fn may_fit(&self, other: &Decided, shown: &Fit, by: f64) -> bool {
-        other.names_nothing() || {
-            let read = Workbench::new(&self.problem, &[]);
-            gained(shown, &fit::fit(&read, &other.selection.fit.model, None)) > by
-        }
-    }
-
-    /// What is decided about it, and what that leaves of the readings.
-    fn decided(&self, options: &Options, progress: &mut dyn FnMut(f64, &str)) -> (Decided, Fit) {
-        let read = Workbench::new(&self.problem, &options.without);
-        // Noise with a memory is made white for all that is decided; what is shown is as it was read.
-        let white = read.whitened();
-        let bench = white.as_ref().unwrap_or(&read);
-        let others = Unfitted::all(&self.holdouts, &self.problem.name);
-        let mut decided = decide((bench, &read), &others, options.seed, progress);
-        // Behind what cuts or rounds, noise is not what the model file states: there readings have to do as they are.
-        if bench.is_white() && (decided.names_nothing() || decided.names_a_cut()) {
-            let again = decide((&read, &read), &others, options.seed, progress);
-            if again.names_a_cut() || (decided.names_a_cut() && !again.names_nothing()) {
-                decided = again;
-            }
-        }
-        let bench = decided.bench(&read, white.as_ref());
-        let shown = decided.selection.fit.as_read(bench, &read);
-        (decided, shown)
-    }
-}
-
 /// By how much the loss is smaller with the second of two fits, both in the smaller spread.
 fn gained(one: &Fit, other: &Fit) -> f64 {
     let sigma = one.sigma.min(other.sigma);
     robust::loss(&one.residual, sigma) - robust::loss(&other.residual, sigma)
 }
 
-/// One signal: decided with the reference in straight lines, and again with a smooth one where that may be better.
+/// One signal: decided with the reference in straight lines or as a smooth course, whichever may be better, or both ways.
 fn one(
     problem: &Problem,
     holdouts: &[Holdout],
@@ -228,20 +175,44 @@ fn one(
         problem: Cow::Borrowed(problem),
         holdouts: Cow::Borrowed(holdouts),
     };
+    let smooth = straight.smooth();
+    let enough = match &smooth {
+        Some((_, true)) => -CLEARLY,
+        _ => CLEARLY,
+    };
+    // Where the smooth one is clearly nearer to begin with, the straight one would lead to names of what it lacks.
+    let nearer = smooth.as_ref().and_then(|(smooth, _)| {
+        let [from, to] = [&straight, smooth].map(|course| course.nearest(options));
+        (gained(&from?, &to?) > CLEARLY).then_some(smooth)
+    });
+    let mut ahead = None;
+    if let Some(smooth) = nearer {
+        let (decided, shown) = smooth.decided(options, progress);
+        let otherwise = straight.left_by(&decided.selection.fit.model);
+        let names = !decided.names_nothing() && decided.asks_between();
+        if names && gained(&otherwise, &shown) > enough {
+            let between = Some(errors([&otherwise, &shown]));
+            return tell(smooth, (decided, &shown), between, options, report);
+        }
+        ahead = Some((decided, shown));
+    }
     let (decided, shown) = straight.decided(options, progress);
     if decided.asks_between()
-        && let Some((smooth, told)) = straight.smooth()
+        && let Some((smooth, _)) = smooth.as_ref()
+        && smooth.may_fit(&decided, &shown, enough)
     {
-        let enough = if told { -CLEARLY } else { CLEARLY };
-        if smooth.may_fit(&decided, &shown, enough) {
-            let (again, there) = smooth.decided(options, progress);
-            if gained(&shown, &there) > enough {
-                let errors = [&shown, &there].map(|fit| rms(fit.residual.iter().copied()));
-                return tell(&smooth, (again, &there), Some(errors), options, report);
-            }
+        let (again, there) = ahead.unwrap_or_else(|| smooth.decided(options, progress));
+        if gained(&shown, &there) > enough {
+            let between = Some(errors([&shown, &there]));
+            return tell(smooth, (again, &there), between, options, report);
         }
     }
     tell(&straight, (decided, &shown), None, options, report)
+}
+
+/// Root mean squares of what two fits leave.
+fn errors(fits: [&Fit; 2]) -> [f64; 2] {
+    fits.map(|fit| rms(fit.residual.iter().copied()))
 }
 
 /// Puts what was decided about a signal into the report; `between`: as `course` in [`times_found`].

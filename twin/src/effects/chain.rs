@@ -1,6 +1,6 @@
 //! Runs the simulation with effects, in the order of their stages.
 
-use super::scene::{Scene, boxcar};
+use super::scene::Scene;
 use super::{Effect, Stage};
 use crate::problem::{Base, Problem, View};
 
@@ -265,8 +265,10 @@ impl<'a> Chain<'a> {
             Link::Window => {
                 let (held, drive) = (scene.held(), scene.drive);
                 let window_s = scene.sensor.map_or(0.0, |sensor| sensor.window_s);
-                scene.signal =
-                    boxcar(&drive.t_s, &drive.segments, &scene.signal, window_s, held).into();
+                scene.signal = scene
+                    .steps
+                    .boxcar(drive, &scene.signal, window_s, held)
+                    .into();
             }
             Link::Sample => {
                 scene.delay_s +=

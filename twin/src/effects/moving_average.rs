@@ -1,6 +1,6 @@
 //! Boxcar window.
 
-use super::scene::{Scale, Scene, boxcar};
+use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced, within_a_period};
 
 /// See [`CARD`].
@@ -41,13 +41,9 @@ impl Effect for MovingAverage {
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let held = scene.held();
-        scene.signal = boxcar(
-            &scene.drive.t_s,
-            &scene.drive.segments,
-            &scene.signal,
-            values[0],
-            held,
-        )
-        .into();
+        scene.signal = scene
+            .steps
+            .boxcar(scene.drive, &scene.signal, values[0], held)
+            .into();
     }
 }

@@ -1,6 +1,6 @@
 //! Only a part of each period is measured.
 
-use super::scene::{Cursor, Scale, Scene, floored};
+use super::scene::{Scale, Scene, floored};
 use crate::spectrum;
 
 use super::{Card, Clues, Effect, Parameter, Search, Stage};
@@ -130,6 +130,7 @@ impl Effect for SampledWindow {
         if period <= 0.0 {
             return;
         }
+        let per_s = 1.0 / period;
         let drive = scene.drive;
         let held = scene.held();
         let input = &scene.signal[..];
@@ -137,7 +138,7 @@ impl Effect for SampledWindow {
         // The converter goes on while nothing is recorded: what flowed then is a straight line.
         for rows in drive.operations().iter().filter(|rows| !rows.is_empty()) {
             let start = drive.t_s[rows.start] + phase;
-            let mut cursor = Cursor::new(&drive.t_s, rows.clone());
+            let mut means = scene.steps.means(drive, rows, input, held);
             let (mut value, mut until) = (input[rows.start], f64::NEG_INFINITY);
             let mut known = f64::NAN;
             for (out, t) in output[rows.clone()]
@@ -148,12 +149,12 @@ impl Effect for SampledWindow {
                 // Well before the next window ends there is nothing to ask.
                 if elapsed.is_nan() || elapsed >= until {
                     // The newest window that has ended.
-                    let ended = floored((elapsed - duty * period) / period);
+                    let ended = floored((elapsed - duty * period) * per_s);
                     until = (ended + 1.0 - 1e-6) * period + duty * period;
                     if ended >= 0.0 && ended != known {
                         known = ended;
                         let from = start + ended * period;
-                        value = cursor.mean(input, from, from + duty * period, held);
+                        value = means.mean(from, from + duty * period);
                     }
                 }
                 *out = value;

@@ -158,6 +158,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
     let mut refused = Vec::new();
     let mut step_p99: Vec<(&'static str, f64)> = Vec::new();
     let mut rounds = 0;
+    let mut barred: Vec<(&'static str, usize)> = Vec::new();
     let (now, named) = loop {
         while now.model.members.len() < MOST_EFFECTS {
             let done = now.model.members.len() as f64;
@@ -165,7 +166,9 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                 0.8 * done / (done + 2.0),
                 "trying every effect of the library",
             );
-            let screening = screen(bench, &now, seed.wrapping_add(done as u64), DRAWS);
+            let mut screening = screen(bench, &now, seed.wrapping_add(done as u64), DRAWS);
+            let told = |entry: &Entry| !barred.contains(&entry.member.form());
+            screening.entries.retain(told);
             let Some((better, p99)) =
                 addition(bench, &now, &screening, &mut decisions, &mut refused)
             else {
@@ -179,6 +182,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
             now = better;
         }
         rounds += 1;
+        let full = now.clone();
         progress(
             0.85,
             "trying to do without each effect, and with others in its place",
@@ -228,6 +232,16 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
                     now = polish(bench, &leaner);
                     others = swapped(bench, &now);
                     named = name(bench, &now, &others, &step_p99);
+                }
+                // What was taken out though much is missed without it stood in for something else.
+                if rounds < ROUNDS && share(bench, &now, &full) > FLOOR {
+                    let members = full.model.members.iter();
+                    barred.extend(
+                        members
+                            .filter(|member| !now.model.has(member.id()))
+                            .map(Member::form),
+                    );
+                    continue;
                 }
                 // Small, and as well explained by many others: that is structure, and no name.
                 let Some(vague) = named.iter().find(|one| {
@@ -397,13 +411,14 @@ fn endless(bench: &Workbench<'_>, member: &Member) -> bool {
 fn promising(
     bench: &Workbench<'_>,
     now: &Fit,
-    entries: &[Entry],
+    entries: &[&Entry],
     most: usize,
     starts: usize,
 ) -> Vec<Model> {
     let mut effects: Vec<Vec<&Entry>> = Vec::new();
     for entry in entries
         .iter()
+        .copied()
         .filter(|entry| !endless(bench, &entry.member))
     {
         let key = |entry: &Entry| (entry.member.id(), entry.member.values.len());
@@ -435,11 +450,12 @@ fn added(model: &Model, member: Member) -> Model {
 
 /// Starts besides: the best of each effect with the sizes that its signature has, and what takes most of the error with its
 /// outliers, for what acts in few readings.
-fn besides(bench: &Workbench<'_>, now: &Fit, entries: &[Entry]) -> Vec<Model> {
+fn besides(bench: &Workbench<'_>, now: &Fit, entries: &[&Entry]) -> Vec<Model> {
     let mut ids: Vec<(&str, usize)> = Vec::new();
     let mut members: Vec<Member> = Vec::new();
     let told = entries
         .iter()
+        .copied()
         .filter(|entry| !endless(bench, &entry.member));
     for entry in told.clone() {
         let id = (entry.member.id(), entry.member.values.len());
@@ -465,7 +481,8 @@ fn fits(bench: &Workbench<'_>, models: Vec<Model>) -> Vec<Fit> {
         .collect()
 }
 
-/// The effect, or the two, with which a model grows, and the limit that the placebos set.
+/// The effect, or the two, with which a model grows, and the limit that the placebos set. Forms that are as free as to imitate a few
+/// others at once are asked where plainer ones do not do.
 fn addition(
     bench: &Workbench<'_>,
     now: &Fit,
@@ -473,20 +490,38 @@ fn addition(
     decisions: &mut Vec<String>,
     refused: &mut Vec<String>,
 ) -> Option<(Fit, f64)> {
+    let (free, plain): (Vec<&Entry>, Vec<&Entry>) = screening
+        .entries
+        .iter()
+        .partition(|entry| entry.member.effect.remembers());
+    let all: Vec<&Entry> = screening.entries.iter().collect();
+    let p99 = screening.placebo_p99;
+    let mut grown = |entries: &[&Entry]| added_of(bench, now, (entries, p99), decisions, refused);
+    grown(&plain).or_else(|| (!free.is_empty()).then(|| grown(&all)).flatten())
+}
+
+/// The same of some candidates, with the limit.
+fn added_of(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    (entries, p99): (&[&Entry], f64),
+    decisions: &mut Vec<String>,
+    refused: &mut Vec<String>,
+) -> Option<(Fit, f64)> {
     let (mut said, mut said_besides) = (Vec::new(), Vec::new());
-    let usual = promising(bench, now, &screening.entries, FITTED, STARTS);
-    let single = step(bench, now, usual, screening, &mut said, refused);
+    let usual = promising(bench, now, entries, FITTED, STARTS);
+    let single = step(bench, now, usual, p99, &mut said, refused);
     // Where two effects hide each other, the best single one can be the wrong one: pairs are tried at the beginning, and
     // whenever nothing passes alone.
     let double = if now.model.members.is_empty() || single.is_none() {
         let single = single.as_ref().map(|(fit, _)| fit);
-        pair(bench, now, screening, single, &mut said, refused)
+        pair(bench, now, (entries, p99), single, &mut said, refused)
     } else {
         None
     };
     let found = double.or(single);
-    let others = besides(bench, now, &screening.entries);
-    let other = step(bench, now, others, screening, &mut said_besides, refused);
+    let others = besides(bench, now, entries);
+    let other = step(bench, now, others, p99, &mut said_besides, refused);
     let is_better = match (&found, &other) {
         (Some((found, _)), Some((other, _))) => {
             // One that does as well as two is better.
@@ -509,7 +544,7 @@ fn step(
     bench: &Workbench<'_>,
     now: &Fit,
     models: Vec<Model>,
-    screening: &Screening,
+    placebo_p99: f64,
     decisions: &mut Vec<String>,
     refused: &mut Vec<String>,
 ) -> Option<(Fit, f64)> {
@@ -543,13 +578,13 @@ fn step(
         if gain <= 0.0 {
             continue;
         }
-        if gain <= screening.placebo_p99 {
+        if gain <= placebo_p99 {
             note(
                 refused,
                 format!(
                     "{id}: takes {} of the held-out error, placebos up to {}",
                     percent(gain),
-                    percent(screening.placebo_p99)
+                    percent(placebo_p99)
                 ),
             );
             continue;
@@ -561,9 +596,9 @@ fn step(
                     "{id} added: takes {} of the held-out error; the best of {} placebos of the whole library takes {} (99th percentile).",
                     percent(gain),
                     DRAWS,
-                    percent(screening.placebo_p99)
+                    percent(placebo_p99)
                 ));
-                return Some((better, screening.placebo_p99));
+                return Some((better, placebo_p99));
             }
         }
     }
@@ -799,7 +834,7 @@ fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
 fn pair(
     bench: &Workbench<'_>,
     now: &Fit,
-    screening: &Screening,
+    (entries, placebo_p99): (&[&Entry], f64),
     single: Option<&Fit>,
     decisions: &mut Vec<String>,
     refused: &mut Vec<String>,
@@ -811,16 +846,22 @@ fn pair(
     if now.model.members.len() + 2 > MOST_EFFECTS {
         return None;
     }
-    let least = pairs_gain(screening.placebo_p99);
+    let least = pairs_gain(placebo_p99);
+    // Free forms are among the second ones where they are among the first.
+    let free = entries.iter().any(|entry| entry.member.effect.remembers());
+    let joins = |entry: &Entry| free || !entry.member.effect.remembers();
     // A masked effect shows once the other is fitted: from each of the best single ones one goes a step further.
-    let firsts = promising(bench, now, &screening.entries, FIRSTS, 1);
+    let firsts = promising(bench, now, entries, FIRSTS, 1);
     let models: Vec<Model> = fits(bench, firsts)
         .par_iter()
         .flat_map_iter(|first| {
             let taken = share(bench, now, first).max(0.0);
-            let mut entries = screen(bench, first, 0, 0).entries;
-            entries.retain(|entry| taken + entry.gain * (1.0 - taken) > STARTED * least);
-            promising(bench, first, &entries, FIRSTS, 1)
+            let seconds = screen(bench, first, 0, 0).entries;
+            let begun = |entry: &&Entry| {
+                taken + entry.gain * (1.0 - taken) > STARTED * least && joins(entry)
+            };
+            let seconds: Vec<&Entry> = seconds.iter().filter(begun).collect();
+            promising(bench, first, &seconds, FIRSTS, 1)
         })
         // One more branch of the first is no second effect.
         .filter(|model| model.members.len() == now.model.members.len() + 2)
@@ -839,20 +880,18 @@ fn pair(
         .into_iter()
         .take(PAIRS)
         .map(|(fit, _)| fit)
-        .find(
-            |best| match unfit(bench, now, best, screening.placebo_p99, single) {
-                Some(why) => {
-                    let ids = best.model.ids();
-                    let count = ids.len();
-                    note(
-                        refused,
-                        format!("{} with {}: {why}", ids[count - 2], ids[count - 1]),
-                    );
-                    false
-                }
-                None => true,
-            },
-        )?;
+        .find(|best| match unfit(bench, now, best, placebo_p99, single) {
+            Some(why) => {
+                let ids = best.model.ids();
+                let count = ids.len();
+                note(
+                    refused,
+                    format!("{} with {}: {why}", ids[count - 2], ids[count - 1]),
+                );
+                false
+            }
+            None => true,
+        })?;
     let ids = best.model.ids();
     let count = ids.len();
     decisions.push(format!(
@@ -861,7 +900,7 @@ fn pair(
         ids[count - 1],
         percent(share(bench, now, &best))
     ));
-    Some((best, screening.placebo_p99))
+    Some((best, placebo_p99))
 }
 
 /// Share of the held-out error that two effects have to take together: each may gain what a placebo gains.

@@ -49,6 +49,11 @@ impl Member {
     pub fn id(&self) -> &'static str {
         self.effect.card().id
     }
+
+    /// Its effect's id and how many values that has: an effect may have several forms.
+    pub fn form(&self) -> (&'static str, usize) {
+        (self.id(), self.values.len())
+    }
 }
 
 /// A model: effects with values, and what the base may differ by.

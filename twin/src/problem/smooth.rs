@@ -8,10 +8,12 @@ use std::ops::Range;
 
 use super::{Base, Drive, Problem, Series};
 
-/// Rows that take one step's place.
+/// Rows that take one step's place at most.
 const PARTS: usize = 4;
-/// A drive of more rows stays as it was recorded: four times as many would take too long.
-const MOST_ROWS: usize = 60_000;
+/// And at least: a drive that has too many rows even so stays as it was recorded.
+const LEAST_PARTS: usize = 2;
+/// Rows between which a smooth course is followed, at most: more would take too long.
+const MOST_ROWS: usize = 240_000;
 /// Each second row is told by its neighbours: the course bends if a cubic's bend is there by more than this share.
 const BENDS: f64 = 0.5;
 /// The rows alone tell that it bends if that takes this share of the squared error of straight lines.
@@ -27,7 +29,8 @@ impl Problem {
             return None;
         };
         let as_it_is = base.held_reference || base.quasi_static || base.smooth_reference;
-        if as_it_is || !base.reading.is_empty() || self.drive.len() > MOST_ROWS {
+        let too_many = self.drive.len() * LEAST_PARTS > MOST_ROWS;
+        if as_it_is || !base.reading.is_empty() || too_many {
             return None;
         }
         let (bend, share) = bend(&self.drive);
@@ -89,15 +92,21 @@ fn between(t_s: [f64; 4], y: [f64; 4], t: f64) -> Option<(f64, f64)> {
     Some((straight, straight + bent))
 }
 
-/// The drive with [`PARTS`] rows for each step. What surrounds the sensor goes in straight lines, a range flag stays until its next
+/// Rows that take one step's place in a drive of so many.
+fn parts(rows: usize) -> usize {
+    (MOST_ROWS / rows.max(1)).clamp(LEAST_PARTS, PARTS)
+}
+
+/// The drive with some rows for each step. What surrounds the sensor goes in straight lines, a range flag stays until its next
 /// row.
 fn finer(drive: &Drive) -> Drive {
     let mut segments: Vec<Range<usize>> = Vec::with_capacity(drive.segments.len());
-    let mut places: Vec<(usize, usize)> = Vec::with_capacity(PARTS * drive.len());
+    let in_a_step = parts(drive.len());
+    let mut places: Vec<(usize, usize)> = Vec::with_capacity(in_a_step * drive.len());
     for rows in &drive.segments {
         let first = places.len();
         for row in rows.clone() {
-            let parts = if row + 1 < rows.end { PARTS } else { 1 };
+            let parts = if row + 1 < rows.end { in_a_step } else { 1 };
             places.extend((0..parts).map(|part| (row, part)));
         }
         segments.push(first..places.len());
@@ -107,7 +116,7 @@ fn finer(drive: &Drive) -> Drive {
             0 => series[*row],
             part => {
                 let (from, to) = (series[*row], series[row + 1]);
-                from + (to - from) * *part as f64 / PARTS as f64
+                from + (to - from) * *part as f64 / in_a_step as f64
             }
         };
         places.iter().map(at).collect()
@@ -144,7 +153,7 @@ fn finer(drive: &Drive) -> Drive {
         ambient_c: also(&drive.ambient_c),
         segments,
         continues: drive.continues.clone(),
-        parts: PARTS,
+        parts: in_a_step,
     }
 }
 
