@@ -10,6 +10,8 @@ const HELD_SHARE: f64 = 0.2;
 const AGAIN: f64 = 1.5 - 1e-4;
 /// Of readings that come again up to this share come a third time by chance.
 const BY_CHANCE: f64 = 0.1;
+/// Readings that differ by no more than this share of the largest one are the same: those are the last digits of arithmetic.
+const DIGITS: f64 = 1e-12;
 /// The reference moves if it changes by this many of the sensor's own steps.
 const MOVING_STEPS: f64 = 2.0;
 
@@ -49,16 +51,21 @@ pub fn freshness(
     let t_s = frame.t_s();
     let rows = value.len();
     let pairs = || pairs(frame, value);
-    let Some(step) = smallest_step(pairs(), value) else {
-        return Freshness::all(rows);
-    };
     let (low, high) = value
         .iter()
         .filter(|value| value.is_finite())
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
             (low.min(*value), high.max(*value))
         });
-    let favourite = most_repeated(pairs(), value);
+    let digits = DIGITS * low.abs().max(high.abs());
+    let same = |before: usize, after: usize| (value[after] - value[before]).abs() <= digits;
+    let Some(step) = smallest_step(pairs(), value, digits) else {
+        return Freshness::all(rows);
+    };
+    let favourite = most_repeated(
+        pairs().filter(|(before, after)| same(*before, *after)),
+        value,
+    );
     let moves = |before: usize, after: usize| {
         if beside {
             (reference[after] - reference[before]).abs() > MOVING_STEPS * step
@@ -75,7 +82,7 @@ pub fn freshness(
             continue;
         }
         moved += 1;
-        if value[before] == value[after] {
+        if same(before, after) {
             repeated += 1;
             at_once += usize::from(last_repeat == Some(before));
             last_repeat = Some(after);
@@ -103,7 +110,7 @@ pub fn freshness(
             last_change = None;
         }
         before_row = after;
-        if value[after] != value[before] {
+        if !same(before, after) {
             if let Some(since) = last_change {
                 spans.push(t_s[after] - since);
             }
@@ -129,7 +136,7 @@ pub fn freshness(
         }
         before_row = after;
         let since = t_s[after] - last_fresh;
-        if value[after] != value[before] || since >= AGAIN * interval_s {
+        if !same(before, after) || since >= AGAIN * interval_s {
             fresh[after] = true;
             last_fresh = t_s[after];
         }
@@ -152,10 +159,14 @@ fn pairs<'a>(frame: &'a Frame, value: &'a [f64]) -> impl Iterator<Item = (usize,
 }
 
 /// The smallest step there is; not the very smallest, which may be rounding.
-fn smallest_step(pairs: impl Iterator<Item = (usize, usize)>, value: &[f64]) -> Option<f64> {
+fn smallest_step(
+    pairs: impl Iterator<Item = (usize, usize)>,
+    value: &[f64],
+    digits: f64,
+) -> Option<f64> {
     let mut steps: Vec<f64> = pairs
         .map(|(before, after)| (value[after] - value[before]).abs())
-        .filter(|step| *step > 0.0)
+        .filter(|step| *step > digits)
         .collect();
     if steps.is_empty() {
         return None;
@@ -164,12 +175,9 @@ fn smallest_step(pairs: impl Iterator<Item = (usize, usize)>, value: &[f64]) -> 
     Some(*steps.select_nth_unstable_by(few, f64::total_cmp).1)
 }
 
-/// The value that is repeated most.
+/// Of repeats the value that there are most of.
 fn most_repeated(pairs: impl Iterator<Item = (usize, usize)>, value: &[f64]) -> Option<f64> {
-    let mut repeats: Vec<f64> = pairs
-        .filter(|(before, after)| value[*before] == value[*after])
-        .map(|(before, _)| value[before])
-        .collect();
+    let mut repeats: Vec<f64> = pairs.map(|(before, _)| value[before]).collect();
     repeats.sort_unstable_by(f64::total_cmp);
     repeats
         .chunk_by(|one, other| one == other)
