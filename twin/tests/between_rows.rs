@@ -51,13 +51,17 @@ fn window(input: &[f64], length: usize) -> Vec<f64> {
 }
 
 fn explained(reading: &[f64], seed: u64) -> Report {
-    let current = load();
+    of(&load(), reading, NOISE_A, seed)
+}
+
+/// What is said of a current and a reading of it, both on the finer grid.
+fn of(current: &[f64], reading: &[f64], noise_a: f64, seed: u64) -> Report {
     let rows = || (0..ROWS).map(|row| row * FINE);
-    let mut noise = noise(seed, NOISE_A);
+    let mut noise = noise(seed, noise_a);
     let t_s: Vec<f64> = (0..ROWS).map(|row| row as f64 * STEP_S).collect();
     let value = rows().map(|at| reading[at] + noise()).collect();
     let reference = rows().map(|at| current[at]).collect();
-    said(sensor(t_s, reference, value, NOISE_A), seed, &[])
+    said(sensor(t_s, reference, value, noise_a), seed, &[])
 }
 
 /// The value of the one effect that is named, with the ids that it may be.
@@ -115,5 +119,38 @@ fn a_window_and_a_lag_are_as_long_as_they_are() {
         let (ids, found) = only(&report);
         assert_eq!(ids[0], "lag", "{}", report.summary);
         assert_near(found, 0.3, STEP_S * STEP_S / (12.0 * 0.3));
+    }
+}
+
+/// Steps of half a second to six seconds, in A, that come as late as a motor's current does.
+fn blunted_steps(seed: u64) -> Vec<f64> {
+    let mut random = noise(seed ^ 0x5eed, 1.0);
+    let (mut steps, mut size, mut left) = (Vec::new(), 0.0, 0usize);
+    for _ in 0..ROWS * FINE {
+        if left == 0 {
+            left = 50 + (120.0 * random().abs()) as usize;
+            size = 25.0 + 60.0 * random();
+        }
+        left -= 1;
+        steps.push(size);
+    }
+    low_pass(&steps, 2.0)
+}
+
+#[test]
+fn a_delay_hides_neither_a_gain_nor_an_offset() {
+    for seed in 0..6 {
+        let current = blunted_steps(seed);
+        let late: Vec<f64> = (0..current.len())
+            .map(|k| 1.01 * current[k.saturating_sub(FINE / 2)] + 0.8)
+            .collect();
+        let report = of(&current, &late, 0.5, seed);
+        let mut ids: Vec<&str> = report.effects.iter().map(|e| e.id.as_str()).collect();
+        ids.sort_unstable();
+        let [time, gain, offset] = ids[..] else {
+            panic!("{seed}: {}", report.summary);
+        };
+        assert_eq!((gain, offset), ("gain", "offset"), "{}", report.summary);
+        assert!(["delay", "lag"].contains(&time), "{}", report.summary);
     }
 }

@@ -184,6 +184,21 @@ fn a_held_value_counts_once() {
 }
 
 #[test]
+fn the_last_digits_of_arithmetic_are_no_new_reading() {
+    let rows = (0..1000).map(|k| {
+        let t = f64::from(k) * 0.02;
+        let held = current(f64::from(k / 5) * 0.1);
+        vec![
+            t,
+            current(t),
+            held * (1.0 + f64::EPSILON * f64::from(k % 3)),
+        ]
+    });
+    let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    assert_eq!(problem.observed.valid_rows(), 200);
+}
+
+#[test]
 fn a_held_value_that_stays_the_same_was_measured_again() {
     // At a rail from 5 s to 10 s.
     let rows = (0..1000).map(|k| {

@@ -186,6 +186,27 @@ mod tests {
     }
 
     #[test]
+    fn a_long_drive_is_followed_in_fewer_parts() {
+        for (rows, in_a_step) in [(10, 4), (60_000, 4), (80_000, 3), (108_000, 2)] {
+            assert_eq!(parts(rows), in_a_step, "{rows}");
+            assert!(rows * in_a_step <= MOST_ROWS);
+        }
+        let wave =
+            |rows: u32| -> Vec<f64> { (0..rows).map(|k| (f64::from(k) / 9.0).sin()).collect() };
+        let t_s = |rows: u32| (0..rows).map(f64::from).collect();
+        assert_eq!(
+            problem(t_s(108_000), wave(108_000))
+                .smoothed()
+                .unwrap()
+                .0
+                .drive
+                .parts,
+            2
+        );
+        assert!(problem(t_s(121_000), wave(121_000)).smoothed().is_none());
+    }
+
+    #[test]
     fn a_wave_is_followed_between_its_rows_and_steps_are_left_alone() {
         let wave = |t: f64| 50.0 * (t / 3.0).sin() + 40.0 * (1.3 * t).sin();
         // Rows as a bus gives them.
