@@ -260,9 +260,10 @@ fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<Stri
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
+#[allow(clippy::unwrap_used, clippy::expect_used)]
 mod tests {
     use super::*;
+    use crate::problem::{Accuracy, Coloured, Drive, Observed, Problem, SensorBase, View};
 
     #[test]
     fn what_a_recording_does_not_tell_is_told_from_what_it_does() {
@@ -314,5 +315,60 @@ mod tests {
         assert!(says("lag", &[[0.01, 2.0]]).unwrap().contains("tau_s"));
         assert!(says("ocv-hysteresis", &[[-3.0, 1.8], [1e-6, 1e-5]]).is_some());
         assert_eq!(says("ocv-hysteresis", &[[0.01, 0.02], [60.0, 300.0]]), None);
+    }
+
+    /// A ramp to and fro whose readings saturate beyond 60 A.
+    fn saturating(softness: f64) -> Problem {
+        let t_s: Vec<f64> = (0..2400).map(|row| 0.1 * f64::from(row)).collect();
+        let current: Vec<f64> = t_s
+            .iter()
+            .map(|t| 80.0 * (0.11 * t).sin() + 30.0 * (0.83 * t).sin())
+            .collect();
+        let noise = t_s.iter().map(|t| 0.1 * (9973.0 * t * t).sin());
+        let reading = current.iter().zip(noise).map(|(i, noise)| {
+            let beyond = (i.abs() - 60.0).max(0.0);
+            let read = i.abs().min(60.0) + beyond / (1.0 + beyond / (softness * 60.0));
+            read.copysign(*i) + noise
+        });
+        Problem {
+            view: View::Sensor,
+            name: "i_meas_a".into(),
+            unit: "A".into(),
+            observed: Observed::with_drive(t_s.clone(), reading.collect()),
+            drive: Drive {
+                segments: std::iter::once(0..t_s.len()).collect(),
+                continues: vec![false],
+                reference: current.into(),
+                t_s: t_s.into(),
+                ..Drive::default()
+            },
+            base: Base::Sensor(SensorBase::default()),
+            modelled: Vec::new(),
+            noise: 0.08,
+            coloured: Coloured::default(),
+            accuracy: Accuracy::default(),
+        }
+    }
+
+    #[test]
+    fn what_the_last_fit_brought_to_the_end_of_physics_is_taken_back() {
+        let problem = saturating(1.0);
+        let bench = Workbench::new(&problem, &[]);
+        let named = || select::select(&bench, 0, &mut |_, _| {});
+        let mut selection = named();
+        let saturates = |selection: &Selection| {
+            let ids = selection.fit.model.ids();
+            ids.iter().position(|id| *id == "core-saturation")
+        };
+        vague(&bench, &mut selection);
+        let index = saturates(&selection).expect("a core that saturates is named and stays");
+        // As a fit after selection may leave it: as sharp as a corner.
+        let mut model = selection.fit.model.clone();
+        model.members[index].values[1] = model.members[index].effect.bounds(1, &bench.scale).0;
+        selection.fit = Fit::of(&bench, model, selection.fit.cost);
+        vague(&bench, &mut selection);
+        let why = selection.refused.join("\n");
+        assert!(saturates(&selection).is_none(), "{why}");
+        assert!(why.contains("end of what is physics"), "{why}");
     }
 }
