@@ -354,8 +354,7 @@ mod tests {
     fn what_the_last_fit_brought_to_the_end_of_physics_is_taken_back() {
         let problem = saturating(1.0);
         let bench = Workbench::new(&problem, &[]);
-        let named = || select::select(&bench, 0, &mut |_, _| {});
-        let mut selection = named();
+        let mut selection = select::select(&bench, 0, &mut |_, _| {});
         let saturates = |selection: &Selection| {
             let ids = selection.fit.model.ids();
             ids.iter().position(|id| *id == "core-saturation")
