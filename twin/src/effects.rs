@@ -20,6 +20,7 @@ mod gain;
 mod gain_temperature;
 mod hum;
 mod lag;
+mod means;
 mod moving_average;
 mod ocv_hysteresis;
 mod offset;

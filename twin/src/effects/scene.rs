@@ -229,7 +229,7 @@ pub struct Steps {
     /// Length of each kind in s.
     length_s: Vec<f64>,
     /// Length of every step of a segment, where they are all of one kind.
-    even_s: Vec<Option<f64>>,
+    pub(super) even_s: Vec<Option<f64>>,
 }
 
 impl Steps {
@@ -353,45 +353,6 @@ impl Steps {
         output
     }
 
-    /// Boxcar mean over the `window_s` before each row; before the start of a segment the signal stood at its first value.
-    pub fn boxcar(&self, drive: &Drive, input: &[f64], window_s: f64, held: bool) -> Vec<f64> {
-        let mut output = input.to_vec();
-        if window_s.is_nan() || window_s <= 0.0 {
-            return output;
-        }
-        for (rows, even_s) in drive.segments.iter().zip(&self.even_s) {
-            let (input, output) = (&input[rows.clone()], &mut output[rows.clone()]);
-            match even_s {
-                Some(step_s) => even_boxcar(input, window_s / step_s, held, output),
-                None => boxcar(&drive.t_s[rows.clone()], input, window_s, held, output),
-            }
-        }
-        output
-    }
-
-    /// Means of a signal over stretches of an operation; its rows are not to be none.
-    pub fn means<'a>(
-        &self,
-        drive: &'a Drive,
-        rows: &Range<usize>,
-        input: &'a [f64],
-        held: bool,
-    ) -> Means<'a> {
-        let segment = drive.segments.iter().position(|segment| segment == rows);
-        Means(match segment.and_then(|segment| self.even_s[segment]) {
-            Some(step_s) => MeansOver::Even {
-                means: EvenMeans::new(&input[rows.clone()], held),
-                first_s: drive.t_s[rows.start],
-                per_s: 1.0 / step_s,
-            },
-            None => MeansOver::Any {
-                cursor: Cursor::new(&drive.t_s, rows.clone()),
-                input,
-                held,
-            },
-        })
-    }
-
     /// A sum of first-order low-passes of one input, each with a weight, all at rest when a segment begins: one pass over the
     /// rows.
     pub fn ladder<const N: usize>(
@@ -431,7 +392,7 @@ impl Steps {
 
 /// Integral over the step that begins at a row: a trapezoid, or the value held.
 #[inline]
-fn area(t_s: &[f64], input: &[f64], row: usize, held: bool) -> f64 {
+pub(super) fn area(t_s: &[f64], input: &[f64], row: usize, held: bool) -> f64 {
     let mean = if held {
         input[row]
     } else {
@@ -523,7 +484,7 @@ impl<'a> Cursor<'a> {
 
     /// Goes on to the last row not after a time; a sum, with the integral over what was passed.
     #[inline]
-    fn walk(&mut self, mut sum: f64, series: &[f64], t: f64, held: bool) -> f64 {
+    pub(super) fn walk(&mut self, mut sum: f64, series: &[f64], t: f64, held: bool) -> f64 {
         while self.at + 1 < self.rows.end && self.t_s[self.at + 1] <= t {
             sum += area(self.t_s, series, self.at, held);
             self.at += 1;
@@ -533,7 +494,7 @@ impl<'a> Cursor<'a> {
 
     /// Integral from the row where the cursor stands to a time before the next one, or beyond the ends.
     #[inline]
-    fn beyond(&self, series: &[f64], t: f64, held: bool) -> f64 {
+    pub(super) fn beyond(&self, series: &[f64], t: f64, held: bool) -> f64 {
         let at = self.at;
         let h = t - self.t_s[at];
         if h <= 0.0 || at + 1 >= self.rows.end || held {
@@ -542,153 +503,6 @@ impl<'a> Cursor<'a> {
         let step = self.t_s[at + 1] - self.t_s[at];
         let end = series[at] + (series[at + 1] - series[at]) * (h / step);
         0.5 * (series[at] + end) * h
-    }
-}
-
-/// Boxcar mean over the `window_s` before each row; before the start of a segment the signal stood at its first value.
-fn boxcar(t_s: &[f64], input: &[f64], window_s: f64, held: bool, output: &mut [f64]) {
-    // Where the window begins (times go forward within a segment), and the integrals up to there and up to its end.
-    let mut begin = Cursor::new(t_s, 0..t_s.len());
-    let (mut before, mut until) = (0.0, 0.0);
-    for (row, out) in output.iter_mut().enumerate() {
-        if row > 0 {
-            until += area(t_s, input, row - 1, held);
-        }
-        let from = t_s[row] - window_s;
-        before = begin.walk(before, input, from, held);
-        let start = before + begin.beyond(input, from, held);
-        *out = (until - start) / window_s;
-    }
-}
-
-/// Integral at rows of even steps from the first one on, of what is more than its value there (so that sums stay small), in steps.
-fn even_total(input: &[f64], held: bool) -> Vec<f64> {
-    let first = input.first().copied().unwrap_or_default();
-    let mut sum = 0.0;
-    let means = input.windows(2).map(|pair| {
-        let mean = if held {
-            pair[0]
-        } else {
-            0.5 * (pair[0] + pair[1])
-        };
-        sum += mean - first;
-        sum
-    });
-    std::iter::once(0.0).chain(means).collect()
-}
-
-/// Means over any stretches of time of a signal whose rows are even.
-struct EvenMeans<'a> {
-    input: &'a [f64],
-    total: Vec<f64>,
-    held: bool,
-}
-
-impl<'a> EvenMeans<'a> {
-    fn new(input: &'a [f64], held: bool) -> Self {
-        Self {
-            total: even_total(input, held),
-            input,
-            held,
-        }
-    }
-
-    /// Mean from one place to a later one, in steps from the first row; beyond the ends the signal holds its end values.
-    #[inline]
-    fn mean(&self, from: f64, to: f64) -> f64 {
-        let last = self.input.len() - 1;
-        let row = from as usize;
-        if from >= 0.0 && row < last && to <= (row + 1) as f64 {
-            // Of a straight line it is the value in the middle.
-            let part = if self.held {
-                0.0
-            } else {
-                0.5 * (from + to) - row as f64
-            };
-            return self.input[row] + (self.input[row + 1] - self.input[row]) * part;
-        }
-        self.input[0] + (self.until(to) - self.until(from)) / (to - from)
-    }
-
-    /// Integral up to a place, of what is more than the first value.
-    #[inline]
-    fn until(&self, place: f64) -> f64 {
-        let (first, last) = (self.input[0], self.input.len() - 1);
-        if place <= 0.0 {
-            return 0.0;
-        }
-        let row = place as usize;
-        if row >= last {
-            return self.total[last] + (self.input[last] - first) * (place - last as f64);
-        }
-        let (here, part) = (self.input[row], place - row as f64);
-        let bent = if self.held {
-            0.0
-        } else {
-            0.5 * part * part * (self.input[row + 1] - here)
-        };
-        self.total[row] + part * (here - first) + bent
-    }
-}
-
-/// Means of a signal over stretches of time that mostly go forward.
-pub struct Means<'a>(MeansOver<'a>);
-
-enum MeansOver<'a> {
-    Even {
-        means: EvenMeans<'a>,
-        first_s: f64,
-        per_s: f64,
-    },
-    Any {
-        cursor: Cursor<'a>,
-        input: &'a [f64],
-        held: bool,
-    },
-}
-
-impl Means<'_> {
-    /// Mean from one time to a later one, in s; beyond the ends the signal holds its end values.
-    #[inline]
-    pub fn mean(&mut self, from_s: f64, to_s: f64) -> f64 {
-        match &mut self.0 {
-            MeansOver::Even {
-                means,
-                first_s,
-                per_s,
-            } => means.mean((from_s - *first_s) * *per_s, (to_s - *first_s) * *per_s),
-            MeansOver::Any {
-                cursor,
-                input,
-                held,
-            } => cursor.mean(input, from_s, to_s, *held),
-        }
-    }
-}
-
-/// The same over rows of even steps; the window's length is in steps. Every window begins at the same part of a step.
-fn even_boxcar(input: &[f64], window: f64, held: bool, output: &mut [f64]) {
-    let Some(first) = input.first().copied() else {
-        return;
-    };
-    let total = even_total(input, held);
-    let whole = window.floor();
-    let part = 1.0 - (window - whole);
-    // From a row to where the window begins after it.
-    let [from, to] = if held {
-        [part, 0.0]
-    } else {
-        [part - 0.5 * part * part, 0.5 * part * part]
-    };
-    let back = (whole as usize).saturating_add(1).min(input.len());
-    let (beginning, rest) = output.split_at_mut(back);
-    for (out, total) in beginning.iter_mut().zip(&total) {
-        *out = first + total / window;
-    }
-    let starts = total.iter().zip(input.windows(2));
-    for ((out, until), (total, pair)) in rest.iter_mut().zip(&total[back..]).zip(starts) {
-        let start = total + from * (pair[0] - first) + to * (pair[1] - first);
-        *out = first + (until - start) / window;
     }
 }
 
@@ -1059,53 +873,6 @@ mod tests {
         let t_s: Vec<f64> = (0..2000).map(|k| f64::from(k) * 0.01).collect();
         let output = Steps::new(&drive(&t_s)).low_pass(&[0..2000], &t_s, 0.5, false);
         assert!((output[1999] - (t_s[1999] - 0.5)).abs() < 1e-9);
-    }
-
-    #[test]
-    fn a_boxcar_follows_a_ramp_late_by_half_its_window() {
-        let t_s: Vec<f64> = (0..2000).map(|k| f64::from(k) * 0.01).collect();
-        let output = Steps::new(&drive(&t_s)).boxcar(&drive(&t_s), &t_s, 0.333, false);
-        assert!((output[1999] - (t_s[1999] - 0.1665)).abs() < 1e-9);
-    }
-
-    #[test]
-    fn a_mean_over_even_steps_is_one_over_any() {
-        let t_s: Vec<f64> = (0..60).map(|k| 5.0 + f64::from(k) * 0.01).collect();
-        let input: Vec<f64> = (0..60).map(|k| 300.0 + f64::from(k * 7 % 23)).collect();
-        for held in [false, true] {
-            let even = EvenMeans::new(&input, held);
-            let mut any = Cursor::new(&t_s, 0..60);
-            for (period, length) in [(0.007, 1e-4), (0.005, 0.005), (0.031, 0.02), (0.2, 0.2)] {
-                let mut from = -0.04;
-                while from < 0.64 {
-                    let expected = any.mean(&input, 5.0 + from, 5.0 + from + length, held);
-                    let found = even.mean(from / 0.01, (from + length) / 0.01);
-                    assert!(
-                        (found - expected).abs() < 1e-7,
-                        "{held} {length} {from}: {found} {expected}"
-                    );
-                    from += period;
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn a_boxcar_over_even_steps_is_one_over_any() {
-        let t_s: Vec<f64> = (0..200).map(|k| 5.0 + f64::from(k) * 0.01).collect();
-        let input: Vec<f64> = (0..200)
-            .map(|k| 300.0 + 40.0 * f64::from(k * 7 % 23))
-            .collect();
-        let (mut even, mut any) = (vec![0.0; 200], vec![0.0; 200]);
-        for held in [false, true] {
-            for window_s in [1e-4, 0.003, 0.01, 0.02, 0.0271, 0.5, 1.99, 2.0, 2.3, 1e6] {
-                even_boxcar(&input, window_s / 0.01, held, &mut even);
-                boxcar(&t_s, &input, window_s, held, &mut any);
-                let apart = even.iter().zip(&any).map(|(even, any)| (even - any).abs());
-                let most = apart.fold(0.0, f64::max);
-                assert!(most < 1e-7, "{held} {window_s}: {most}");
-            }
-        }
     }
 
     #[test]
