@@ -524,9 +524,12 @@ fn added_of(
     let other = step(bench, now, others, p99, &mut said_besides, refused);
     let is_better = match (&found, &other) {
         (Some((found, _)), Some((other, _))) => {
-            // One that does as well as two is better.
+            // One that does as well as two is better, and so is the same effect that does better from another start or in
+            // another form.
             let fewer = other.model.members.len() < found.model.members.len();
-            share(bench, found, other) > if fewer { 0.0 } else { HALF }
+            let last = |fit: &Fit| fit.model.members.last().map(Member::id);
+            let same = last(found) == last(other);
+            share(bench, found, other) > if fewer || same { 0.0 } else { HALF }
         }
         _ => found.is_none(),
     };
