@@ -31,8 +31,13 @@ struct Truth {
 }
 
 fn truth() -> Truth {
-    let path =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/panasonic-18650pf/25c-us06.csv");
+    truth_of("25c-us06.csv")
+}
+
+/// The current of a recorded drive, for a car's battery.
+fn truth_of(file: &str) -> Truth {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/panasonic-18650pf");
+    let path = folder.join(file);
     let recording = recording::csv::read(&path).unwrap();
     let (t, i) = (recording.time_s(), recording.need("i_ref_a").unwrap());
     let t_s: Vec<f64> = (0..ROWS).map(|k| k as f64 * STEP_S).collect();
@@ -362,11 +367,8 @@ fn gentle() -> Truth {
     truth
 }
 
-/// Loops of half the largest current, twenty times as high as where the search for a core begins.
-#[test]
-fn a_core_with_wide_and_high_loops() {
-    let truth = gentle();
-    let (remanence_a, coercivity_a) = (11.4, 37.0);
+/// What a core with an air gap gives.
+fn gapped(truth: &Truth, remanence_a: f64, coercivity_a: f64) -> Vec<f64> {
     let limits = [0.5, 0.75, 1.0, 1.25, 1.5].map(|share| share * coercivity_a);
     let (mut stops, mut before) = ([0.0f64; 5], 0.0);
     let reading = truth.current_a.iter().map(|i| {
@@ -376,8 +378,17 @@ fn a_core_with_wide_and_high_loops() {
         before = *i;
         i - remanence_a * stops.iter().sum::<f64>() / limits.iter().sum::<f64>()
     });
+    reading.collect()
+}
+
+/// Loops of half the largest current, twenty times as high as where the search for a core begins.
+#[test]
+fn a_core_with_wide_and_high_loops() {
+    let truth = gentle();
+    let (remanence_a, coercivity_a) = (11.4, 37.0);
+    let reading = gapped(&truth, remanence_a, coercivity_a);
     assert_named(
-        &explained(&truth, reading.collect(), 31, &[]),
+        &explained(&truth, reading, 31, &[]),
         "core-hysteresis",
         &[("remanence_a", 11.4, 0.1), ("coercivity_a", 37.0, 0.3)],
     );
@@ -584,13 +595,18 @@ const SLOW: Coloured = Coloured {
 
 /// Slow noise at each row, in A.
 fn slow_noise(seed: u64) -> Vec<f64> {
+    coloured_noise(SLOW, seed)
+}
+
+/// Noise of which some has a memory, at each row, in A.
+fn coloured_noise(coloured: Coloured, seed: u64) -> Vec<f64> {
     let mut step = noise(seed, 1.0);
-    let kept = (-STEP_S / SLOW.tau_s).exp();
-    let white = (NOISE_A.powi(2) - SLOW.rms.powi(2)).sqrt();
-    let mut slow = SLOW.rms * step();
+    let kept = (-STEP_S / coloured.tau_s).exp();
+    let white = (NOISE_A.powi(2) - coloured.rms.powi(2)).sqrt();
+    let mut slow = coloured.rms * step();
     (0..ROWS)
         .map(|_| {
-            slow = kept * slow + SLOW.rms * (1.0 - kept * kept).sqrt() * step();
+            slow = kept * slow + coloured.rms * (1.0 - kept * kept).sqrt() * step();
             slow + white * step()
         })
         .collect()
@@ -622,6 +638,28 @@ fn slow_noise_hides_no_quick_effect_and_is_none() {
             (0.6..1.4).contains(&(signal.rmse_after / NOISE_A)),
             "{signal:?}"
         );
+    }
+}
+
+#[test]
+fn a_core_is_one_in_noise_with_a_memory() {
+    // On a motorway, where the current seldom turns, what noise with a memory leaves of a core is next to a closed one.
+    let truth = truth_of("25c-hwfet.csv");
+    let coloured = Coloured {
+        rms: 0.48,
+        tau_s: 2.0,
+    };
+    for (seed, remanence_a) in [(0, 4.0), (1, 12.0), (2, 4.0), (3, 12.0)] {
+        let reading = plus(
+            &gapped(&truth, remanence_a, 50.0),
+            &coloured_noise(coloured, seed),
+        );
+        let report = explained_as_read(&truth, reading, coloured, seed, &[]);
+        let expected = [
+            ("remanence_a", remanence_a, 0.3),
+            ("coercivity_a", 50.0, 4.0),
+        ];
+        assert_named(&report, "core-hysteresis", &expected);
     }
 }
 
