@@ -78,6 +78,32 @@ fn even_total(input: &[f64], held: bool) -> Vec<f64> {
     std::iter::once(0.0).chain(means).collect()
 }
 
+/// [`boxcar`] over rows of even steps; the window's length is in steps. Every window begins at the same part of a step.
+fn even_boxcar(input: &[f64], window: f64, held: bool, output: &mut [f64]) {
+    let Some(first) = input.first().copied() else {
+        return;
+    };
+    let total = even_total(input, held);
+    let whole = window.floor();
+    let part = 1.0 - (window - whole);
+    // From a row to where the window begins after it.
+    let [from, to] = if held {
+        [part, 0.0]
+    } else {
+        [part - 0.5 * part * part, 0.5 * part * part]
+    };
+    let back = (whole as usize).saturating_add(1).min(input.len());
+    let (beginning, rest) = output.split_at_mut(back);
+    for (out, total) in beginning.iter_mut().zip(&total) {
+        *out = first + total / window;
+    }
+    let starts = total.iter().zip(input.windows(2));
+    for ((out, until), (total, pair)) in rest.iter_mut().zip(&total[back..]).zip(starts) {
+        let start = total + from * (pair[0] - first) + to * (pair[1] - first);
+        *out = first + (until - start) / window;
+    }
+}
+
 /// Means over any stretches of time of a signal whose rows are even.
 struct EvenMeans<'a> {
     input: &'a [f64],
@@ -167,46 +193,10 @@ impl Means<'_> {
     }
 }
 
-/// The same over rows of even steps; the window's length is in steps. Every window begins at the same part of a step.
-fn even_boxcar(input: &[f64], window: f64, held: bool, output: &mut [f64]) {
-    let Some(first) = input.first().copied() else {
-        return;
-    };
-    let total = even_total(input, held);
-    let whole = window.floor();
-    let part = 1.0 - (window - whole);
-    // From a row to where the window begins after it.
-    let [from, to] = if held {
-        [part, 0.0]
-    } else {
-        [part - 0.5 * part * part, 0.5 * part * part]
-    };
-    let back = (whole as usize).saturating_add(1).min(input.len());
-    let (beginning, rest) = output.split_at_mut(back);
-    for (out, total) in beginning.iter_mut().zip(&total) {
-        *out = first + total / window;
-    }
-    let starts = total.iter().zip(input.windows(2));
-    for ((out, until), (total, pair)) in rest.iter_mut().zip(&total[back..]).zip(starts) {
-        let start = total + from * (pair[0] - first) + to * (pair[1] - first);
-        *out = first + (until - start) / window;
-    }
-}
-
 #[cfg(test)]
-#[allow(clippy::single_range_in_vec_init)]
 mod tests {
     use super::*;
-
-    fn drive(t_s: &[f64]) -> Drive {
-        Drive {
-            t_s: t_s.to_vec().into(),
-            reference: vec![0.0; t_s.len()].into(),
-            segments: vec![0..t_s.len()],
-            continues: vec![false],
-            ..Drive::default()
-        }
-    }
+    use crate::effects::scene::tests::drive;
 
     #[test]
     fn a_boxcar_follows_a_ramp_late_by_half_its_window() {

@@ -854,11 +854,11 @@ pub fn open_circuit_v(table: &[(f64, f64)], soc: &[f64]) -> Vec<f64> {
 
 #[cfg(test)]
 #[allow(clippy::single_range_in_vec_init, reason = "one segment")]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
     /// One segment.
-    fn drive(t_s: &[f64]) -> Drive {
+    pub(in crate::effects) fn drive(t_s: &[f64]) -> Drive {
         Drive {
             t_s: t_s.to_vec().into(),
             reference: vec![0.0; t_s.len()].into(),

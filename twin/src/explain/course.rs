@@ -45,8 +45,8 @@ impl Course<'_> {
         fit::fit(&Workbench::new(&self.problem, &[]), model, None)
     }
 
-    /// What the plainest of the effects that work between the rows leave, with all that is exact and ahead of nothing else: a time, a
-    /// factor and a constant.
+    /// The best fit of a single time (the effects between the rows that have one value) with a factor and a constant (the exact linear
+    /// ones); nothing if the library has no such time.
     pub(super) fn nearest(&self, options: &Options) -> Option<Fit> {
         let bench = Workbench::new(&self.problem, &options.without);
         let clues = bench.clues(&bench.plain);

@@ -421,8 +421,8 @@ fn promising(
         .copied()
         .filter(|entry| !endless(bench, &entry.member))
     {
-        let key = |entry: &Entry| (entry.member.id(), entry.member.values.len());
-        let known = effects.iter().position(|of| key(of[0]) == key(entry));
+        let form = entry.member.form();
+        let known = effects.iter().position(|of| of[0].member.form() == form);
         match known {
             Some(at) => effects[at].push(entry),
             None if effects.len() < most => effects.push(vec![entry]),
@@ -451,16 +451,16 @@ fn added(model: &Model, member: Member) -> Model {
 /// Starts besides: the best of each effect with the sizes that its signature has, and what takes most of the error with its
 /// outliers, for what acts in few readings.
 fn besides(bench: &Workbench<'_>, now: &Fit, entries: &[&Entry]) -> Vec<Model> {
-    let mut ids: Vec<(&str, usize)> = Vec::new();
+    let mut forms: Vec<(&str, usize)> = Vec::new();
     let mut members: Vec<Member> = Vec::new();
     let told = entries
         .iter()
         .copied()
         .filter(|entry| !endless(bench, &entry.member));
     for entry in told.clone() {
-        let id = (entry.member.id(), entry.member.values.len());
-        if !ids.contains(&id) && ids.len() < FITTED {
-            ids.push(id);
+        let form = entry.member.form();
+        if !forms.contains(&form) && forms.len() < FITTED {
+            forms.push(form);
             members.extend(entry.sized(&bench.scale));
         }
     }
@@ -852,7 +852,7 @@ fn pair(
     let least = pairs_gain(placebo_p99);
     // Free forms are among the second ones where they are among the first.
     let free = entries.iter().any(|entry| entry.member.effect.remembers());
-    let joins = |entry: &Entry| free || !entry.member.effect.remembers();
+    let may_follow = |entry: &Entry| free || !entry.member.effect.remembers();
     // A masked effect shows once the other is fitted: from each of the best single ones one goes a step further.
     let firsts = promising(bench, now, entries, FIRSTS, 1);
     let models: Vec<Model> = fits(bench, firsts)
@@ -861,7 +861,7 @@ fn pair(
             let taken = share(bench, now, first).max(0.0);
             let seconds = screen(bench, first, 0, 0).entries;
             let begun = |entry: &&Entry| {
-                taken + entry.gain * (1.0 - taken) > STARTED * least && joins(entry)
+                taken + entry.gain * (1.0 - taken) > STARTED * least && may_follow(entry)
             };
             let seconds: Vec<&Entry> = seconds.iter().filter(begun).collect();
             promising(bench, first, &seconds, FIRSTS, 1)

@@ -10,7 +10,7 @@ const HELD_SHARE: f64 = 0.2;
 const AGAIN: f64 = 1.5 - 1e-4;
 /// Of readings that come again up to this share come a third time by chance.
 const BY_CHANCE: f64 = 0.1;
-/// Readings that differ by no more than this share of the largest one are the same: those are the last digits of arithmetic.
+/// Readings that differ by no more than this share of the largest one are the same: some thousand roundings of a double (2.2e-16).
 const DIGITS: f64 = 1e-12;
 /// The reference moves if it changes by this many of the sensor's own steps.
 const MOVING_STEPS: f64 = 2.0;

@@ -12,7 +12,7 @@ use super::{Base, Drive, Problem, Series};
 const PARTS: usize = 4;
 /// And at least: a drive that has too many rows even so stays as it was recorded.
 const LEAST_PARTS: usize = 2;
-/// Rows between which a smooth course is followed, at most: more would take too long.
+/// Rows of a smooth course at most, for the time that they take: twice those of three hours at 10 Hz (108,000), and some.
 const MOST_ROWS: usize = 240_000;
 /// Each second row is told by its neighbours: the course bends if a cubic's bend is there by more than this share.
 const BENDS: f64 = 0.5;
