@@ -64,18 +64,27 @@ fn boxcar(t_s: &[f64], input: &[f64], window_s: f64, held: bool, output: &mut [f
 
 /// Integral at rows of even steps from the first one on, of what is more than its value there (so that sums stay small), in steps.
 fn even_total(input: &[f64], held: bool) -> Vec<f64> {
-    let first = input.first().copied().unwrap_or_default();
-    let mut sum = 0.0;
-    let means = input.windows(2).map(|pair| {
-        let mean = if held {
-            pair[0]
-        } else {
-            0.5 * (pair[0] + pair[1])
-        };
-        sum += mean - first;
-        sum
-    });
-    std::iter::once(0.0).chain(means).collect()
+    let Some(first) = input.first().copied() else {
+        return Vec::new();
+    };
+    let mut total = vec![0.0; input.len()];
+    // Of a step, twice.
+    let area = |here: f64, next: f64| (here - first) + (if held { here } else { next } - first);
+    // Each sum waits for the one before it: four are made from one.
+    let (fours, rest) = total[1..].as_chunks_mut::<4>();
+    let done = 4 * fours.len();
+    let mut last = 0.0;
+    for (sums, x) in fours.iter_mut().zip(input.windows(5).step_by(4)) {
+        let [a, b, c, d] = [0, 1, 2, 3].map(|k| 0.5 * area(x[k], x[k + 1]));
+        let (ab, cd) = (a + b, c + d);
+        *sums = [last + a, last + ab, last + (ab + c), last + (ab + cd)];
+        last = sums[3];
+    }
+    for (sum, x) in rest.iter_mut().zip(input[done..].windows(2)) {
+        last += 0.5 * area(x[0], x[1]);
+        *sum = last;
+    }
+    total
 }
 
 /// [`boxcar`] over rows of even steps; the window's length is in steps. Every window begins at the same part of a step.
@@ -123,38 +132,50 @@ impl<'a> EvenMeans<'a> {
     /// Mean from one place to a later one, in steps from the first row; beyond the ends the signal holds its end values.
     #[inline]
     fn mean(&self, from: f64, to: f64) -> f64 {
-        let last = self.input.len() - 1;
-        let row = from as usize;
-        if from >= 0.0 && row < last && to <= (row + 1) as f64 {
+        let row = from as i64;
+        if from >= 0.0
+            && to <= row.saturating_add(1) as f64
+            && let [here, next] = self.step(row)
+        {
             // Of a straight line it is the value in the middle.
             let part = if self.held {
                 0.0
             } else {
                 0.5 * (from + to) - row as f64
             };
-            return self.input[row] + (self.input[row + 1] - self.input[row]) * part;
+            return here + (next - here) * part;
         }
         self.input[0] + (self.until(to) - self.until(from)) / (to - from)
+    }
+
+    /// The values at a row and at the next one; nothing beyond the ends.
+    #[inline]
+    fn step(&self, row: i64) -> &[f64] {
+        let row = usize::try_from(row).unwrap_or(usize::MAX);
+        self.input
+            .get(row..row.saturating_add(2))
+            .unwrap_or_default()
     }
 
     /// Integral up to a place, of what is more than the first value.
     #[inline]
     fn until(&self, place: f64) -> f64 {
-        let (first, last) = (self.input[0], self.input.len() - 1);
+        let first = self.input[0];
         if place <= 0.0 {
             return 0.0;
         }
-        let row = place as usize;
-        if row >= last {
+        let row = place as i64;
+        let [here, next] = self.step(row) else {
+            let last = self.input.len() - 1;
             return self.total[last] + (self.input[last] - first) * (place - last as f64);
-        }
-        let (here, part) = (self.input[row], place - row as f64);
+        };
+        let part = place - row as f64;
         let bent = if self.held {
             0.0
         } else {
-            0.5 * part * part * (self.input[row + 1] - here)
+            0.5 * part * part * (next - here)
         };
-        self.total[row] + part * (here - first) + bent
+        self.total[row as usize] + part * (here - first) + bent
     }
 }
 

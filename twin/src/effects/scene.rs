@@ -63,6 +63,8 @@ pub struct Scene<'a> {
     pub observed: &'a Observed,
     /// Steps of the drive's rows.
     pub steps: Arc<Steps>,
+    /// Of each stretch of readings, whether they were taken at the recorded rows of their segment.
+    on_rows: Arc<Vec<bool>>,
     /// Changes of the range, in order.
     pub changes: Arc<Vec<RangeChange>>,
     /// The signal: on drive rows before [`super::Stage::Output`], then on the observation's rows.
@@ -506,35 +508,53 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// A series of even steps, later by some steps; straight lines between rows, the first and last value beyond the ends.
-fn moved(series: &[f64], steps: f64, out: &mut [f64]) {
+/// Of each stretch of readings, whether they were taken at the recorded rows of their segment.
+fn on_rows(drive: &Drive, observed: &Observed) -> Vec<bool> {
+    let stretches = observed.stretches.iter();
+    stretches
+        .map(|(segment, these)| {
+            let rows = drive.segments.get(segment).cloned().unwrap_or_default();
+            let recorded = drive.t_s[rows].iter().step_by(drive.stride());
+            recorded.eq(&observed.t_s[these])
+        })
+        .collect()
+}
+
+/// Every `stride`-th row of a series of even steps, later by some steps; straight lines between rows, the first and last value
+/// beyond the ends.
+fn moved(series: &[f64], stride: usize, steps: f64, out: &mut [f64]) {
     let (Some(first), Some(last)) = (series.first(), series.last()) else {
         return;
     };
     let count = series.len() as isize;
-    let whole = steps.floor().clamp(-count as f64, count as f64);
-    let share = 1.0 - (steps - whole).clamp(0.0, 1.0);
-    let whole = whole as isize;
-    let begin = (whole + 1).clamp(0, count) as usize;
-    let end = (count + whole).clamp(begin as isize, count) as usize;
-    out[..begin].fill(*first);
-    out[end..].fill(*last);
-    let pairs = series
-        .get((begin as isize - whole - 1).max(0) as usize..)
-        .unwrap_or_default()
-        .windows(2);
-    for (out, pair) in out[begin..end].iter_mut().zip(pairs) {
+    // Each value lies so many rows behind its own, and by this share of a step ahead of that.
+    let back = steps.ceil().clamp(-count as f64, count as f64);
+    let share = (back - steps).clamp(0.0, 1.0);
+    let (back, stride) = (back as isize, stride as isize);
+    let rows = out.len() as isize;
+    // The first that has a row ahead of it, and the first that has none behind it.
+    let begin = ((back + stride - 1).div_euclid(stride)).clamp(0, rows);
+    let end = ((count - 1 + back + stride - 1).div_euclid(stride)).clamp(begin, rows);
+    let (head, rest) = out.split_at_mut(begin as usize);
+    let (middle, tail) = rest.split_at_mut((end - begin) as usize);
+    head.fill(*first);
+    tail.fill(*last);
+    if middle.is_empty() {
+        return;
+    }
+    let pairs = series[(begin * stride - back) as usize..].windows(2);
+    for (out, pair) in middle.iter_mut().zip(pairs.step_by(stride as usize)) {
         *out = pair[0] + (pair[1] - pair[0]) * share;
     }
 }
 
-/// A series of even steps at another rate, and later by some steps.
-fn stretched(series: &[f64], rate: f64, steps: f64, out: &mut [f64]) {
+/// Every `stride`-th row of a series of even steps at another rate, and later by some steps.
+fn stretched(series: &[f64], stride: usize, rate: f64, steps: f64, out: &mut [f64]) {
     let (Some(first), Some(last)) = (series.first(), series.last()) else {
         return;
     };
     for (row, out) in out.iter_mut().enumerate() {
-        let at = row as f64 * rate - steps;
+        let at = (row * stride) as f64 * rate - steps;
         let whole = at as usize;
         *out = match (series.get(whole), series.get(whole + 1)) {
             (Some(here), Some(next)) if at > 0.0 => here + (next - here) * (at - whole as f64),
@@ -569,6 +589,7 @@ impl<'a> Scene<'a> {
             drive,
             observed: &problem.observed,
             steps: Arc::new(Steps::new(drive)),
+            on_rows: Arc::new(on_rows(drive, &problem.observed)),
             changes: Arc::new(range_changes(drive, sensor)),
             signal: drive.reference.clone(),
             delay_s: 0.0,
@@ -611,7 +632,7 @@ impl<'a> Scene<'a> {
         let mut known: (usize, Option<(f64, f64)>) = (usize::MAX, None);
         let operations = drive.operation_of_each();
         // One stretch of readings after the other, each within one segment.
-        for (segment, these) in observed.stretches.iter() {
+        for ((segment, these), on_rows) in observed.stretches.iter().zip(self.on_rows.iter()) {
             let rows = drive.segments.get(segment).cloned();
             let Some(rows) = rows.filter(|rows| !rows.is_empty()) else {
                 continue;
@@ -622,12 +643,6 @@ impl<'a> Scene<'a> {
             let start = drive.t_s[operation.start];
             // What the sensor's clock calls t was at this time.
             let reference_s = |t: f64| start + (t - start) / skew - delay_s;
-            // Rows of even steps: all of them move by the same part of a step.
-            let even_rows = if observed.on_drive_rows && !held && total.is_none() {
-                (rows.start, rows.end)
-            } else {
-                (0, 0)
-            };
             let around = if total.is_some() {
                 rows.clone()
             } else {
@@ -647,16 +662,18 @@ impl<'a> Scene<'a> {
             };
             let times = &observed.t_s[these.clone()];
             let values = &mut sampled[these.clone()];
+            // Rows of even steps: all of them move by the same part of a step.
             if let Some(Some(step_s)) = self.steps.even_s.get(segment)
-                && (these.start, these.end) == even_rows
+                && (*on_rows && !held && total.is_none())
             {
+                let (series, stride) = (&self.signal[rows.clone()], drive.stride());
                 let steps = delay_s / step_s;
                 if skew == 1.0 {
-                    moved(&self.signal[these], steps, values);
+                    moved(series, stride, steps, values);
                 } else {
                     // By how much the clock was off when the segment began.
                     let before = (drive.t_s[rows.start] - start) / step_s * (1.0 - 1.0 / skew);
-                    stretched(&self.signal[these], 1.0 / skew, steps + before, values);
+                    stretched(series, stride, 1.0 / skew, steps + before, values);
                 }
                 let ahead = (times.iter().zip(values.iter_mut()))
                     .map(|(t, value)| (reference_s(*t), value))
@@ -908,17 +925,17 @@ pub(super) mod tests {
         for steps in [
             -60.0, -50.0, -49.5, -7.0, -1.3, -0.2, 0.0, 0.4, 1.0, 2.6, 48.9, 49.0, 50.0, 70.2,
         ] {
-            for rate in [1.0, 0.8, 1.1] {
-                let mut out = vec![f64::NAN; 50];
+            for (rate, stride) in [(1.0, 1), (0.8, 1), (1.1, 1), (1.0, 2), (1.0, 3), (1.1, 3)] {
+                let mut out = vec![f64::NAN; 49 / stride + 1];
                 if rate == 1.0 {
-                    moved(&series, steps, &mut out);
+                    moved(&series, stride, steps, &mut out);
                 } else {
-                    stretched(&series, rate, steps, &mut out);
+                    stretched(&series, stride, rate, steps, &mut out);
                 }
                 let mut cursor = Cursor::new(&t_s, 0..50);
-                for (out, t) in out.iter().zip(&t_s) {
+                for (out, t) in out.iter().zip(t_s.iter().step_by(stride)) {
                     let there = cursor.value(&series, rate * t - 0.1 * steps, false);
-                    assert!((out - there).abs() < 1e-9, "{steps} {rate} {t}");
+                    assert!((out - there).abs() < 1e-9, "{steps} {rate} {stride} {t}");
                 }
             }
         }

@@ -1,8 +1,10 @@
 //! The reference between its rows: a smooth course through them instead of straight lines.
 //!
 //! Straight lines blunt a smooth current: a filter behind them is found too short, by Δt²/6 of its variance, and a delay of half a
-//! step looks like a window of one. A cubic through four rows (Hermite, slopes of the parabola through each three; de Boor, A
-//! Practical Guide to Splines, ch. IV) leaves a course of straight pieces where it is one and follows one that bends.
+//! step looks like a window of one. A cubic (Hermite's) leaves a course of straight pieces where it is one and follows one that bends.
+//! Its slopes at the rows are those of the parabola through each three (de Boor, A Practical Guide to Splines, ch. IV), which is
+//! nearest where the course has no kinks, or Akima's (1970, J. ACM 17, 589), which do not carry a kink into the steps beside it: a load
+//! that is switched and low-passed once has one at each switching. The rows themselves tell which.
 
 use std::ops::Range;
 
@@ -14,6 +16,8 @@ const PARTS: usize = 4;
 const LEAST_PARTS: usize = 2;
 /// Rows of a smooth course at most, for the time that they take: twice those of three hours at 10 Hz (108,000), and some.
 const MOST_ROWS: usize = 240_000;
+/// Rows of which a step between the middle two is told.
+const AROUND: usize = 6;
 /// Each second row is told by its neighbours: the course bends if a cubic's bend is there by more than this share.
 const BENDS: f64 = 0.5;
 /// The rows alone tell that it bends if that takes this share of the squared error of straight lines.
@@ -33,62 +37,124 @@ impl Problem {
         if as_it_is || !base.reading.is_empty() || too_many {
             return None;
         }
-        let (bend, share) = bend(&self.drive);
-        (bend > BENDS).then(|| (self.with_smooth_reference(), share > TELLS))
+        let bend = Bend::of(&self.drive);
+        (bend.there > BENDS).then(|| (self.bent(bend.slopes), bend.taken > TELLS))
     }
 
     /// The same with a smooth reference, whatever its rows tell.
     pub fn with_smooth_reference(&self) -> Self {
+        self.bent(Bend::of(&self.drive).slopes)
+    }
+
+    fn bent(&self, slopes: Slopes) -> Self {
         let mut smooth = self.clone();
         if let Base::Sensor(base) = &mut smooth.base {
             base.smooth_reference = true;
         }
-        smooth.drive = finer(&self.drive);
+        smooth.drive = finer(&self.drive, slopes);
         smooth.observed.on_drive_rows = false;
         smooth
     }
 }
 
-/// How much of a cubic's bend there is at rows that are told by their neighbours, at twice the step (0 for straight lines, 1 for a
-/// smooth course), and the share of the squared error of straight lines that this takes.
-fn bend(drive: &Drive) -> (f64, f64) {
-    let (mut along, mut size, mut all) = (0.0, 0.0, 0.0);
-    for rows in drive.segments.iter().filter(|rows| rows.len() >= 7) {
-        for row in rows.start + 3..rows.end - 3 {
-            let at = [row - 3, row - 1, row + 1, row + 3];
-            let t_s = at.map(|row| drive.t_s[row]);
-            let y = at.map(|row| drive.reference[row]);
-            let Some((straight, cubic)) = between(t_s, y, drive.t_s[row]) else {
-                continue;
-            };
-            along += (cubic - straight) * (drive.reference[row] - straight);
-            size += (cubic - straight).powi(2);
-            all += (drive.reference[row] - straight).powi(2);
+/// Where a cubic has its slopes at the rows from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Slopes {
+    /// The parabola through a row and its neighbours.
+    Parabola,
+    /// Akima's mean of the steps to both sides, the heavier the less the course bends on its side.
+    Akima,
+}
+
+impl Slopes {
+    /// At the middle of five rows, of which the steps have these lengths and rises per length.
+    fn at(self, h: [f64; 4], rise: [f64; 4]) -> f64 {
+        let parabola = || (h[2] * rise[1] + h[1] * rise[2]) / (h[1] + h[2]);
+        match self {
+            Self::Parabola => parabola(),
+            Self::Akima => {
+                let (before, after) = ((rise[1] - rise[0]).abs(), (rise[3] - rise[2]).abs());
+                let both = before + after;
+                if both > 0.0 {
+                    (after * rise[1] + before * rise[2]) / both
+                } else {
+                    parabola()
+                }
+            }
         }
-    }
-    if size > 0.0 && all > 0.0 {
-        (along / size, along * along / (size * all))
-    } else {
-        (0.0, 0.0)
     }
 }
 
-/// Value between the second and the third of four points: on the straight line, and on the cubic. `None` where the steps are too
+/// How well a cubic tells rows from their neighbours, at twice the step.
+struct Bend {
+    slopes: Slopes,
+    /// How much of the cubic's bend there is: 0 for straight lines, 1 for a smooth course.
+    there: f64,
+    /// Share of the squared error of straight lines that this takes.
+    taken: f64,
+}
+
+impl Bend {
+    /// With the slopes that tell the rows best.
+    fn of(drive: &Drive) -> Self {
+        let with = |slopes| {
+            let (mut along, mut size, mut all) = (0.0, 0.0, 0.0);
+            for rows in drive
+                .segments
+                .iter()
+                .filter(|rows| rows.len() >= 2 * AROUND)
+            {
+                for row in rows.start + AROUND - 1..=rows.end - AROUND {
+                    let at = std::array::from_fn(|k| row + 2 * k + 1 - AROUND);
+                    let Some((straight, cubic)) = between(drive, at, drive.t_s[row], slopes) else {
+                        continue;
+                    };
+                    along += (cubic - straight) * (drive.reference[row] - straight);
+                    size += (cubic - straight).powi(2);
+                    all += (drive.reference[row] - straight).powi(2);
+                }
+            }
+            let known = size > 0.0 && all > 0.0;
+            let bend = Self {
+                slopes,
+                there: if known { along / size } else { 0.0 },
+                taken: if known {
+                    along * along / (size * all)
+                } else {
+                    0.0
+                },
+            };
+            (bend, size - 2.0 * along)
+        };
+        let [(parabola, error), (akima, other)] = [Slopes::Parabola, Slopes::Akima].map(with);
+        if other < error { akima } else { parabola }
+    }
+}
+
+/// Value between the middle two of some rows at a time: on the straight line, and on the cubic. `None` where the steps are too
 /// uneven.
-fn between(t_s: [f64; 4], y: [f64; 4], t: f64) -> Option<(f64, f64)> {
-    let h = [t_s[1] - t_s[0], t_s[2] - t_s[1], t_s[3] - t_s[2]];
+fn between(drive: &Drive, at: [usize; AROUND], t: f64, slopes: Slopes) -> Option<(f64, f64)> {
+    let (t_s, y) = (
+        at.map(|row| drive.t_s[row]),
+        at.map(|row| drive.reference[row]),
+    );
+    let h: [f64; AROUND - 1] = std::array::from_fn(|k| t_s[k + 1] - t_s[k]);
     let (least, most) = h.iter().fold((f64::INFINITY, 0.0f64), |(least, most), h| {
         (least.min(*h), most.max(*h))
     });
     if least.is_nan() || least <= 0.0 || most > UNEVEN * least {
         return None;
     }
-    let rise = [0, 1, 2].map(|k| (y[k + 1] - y[k]) / h[k]);
-    // Slopes at the two inner points.
-    let slope = [0, 1].map(|k| (h[k + 1] * rise[k] + h[k] * rise[k + 1]) / (h[k] + h[k + 1]));
-    let u = (t - t_s[1]) / h[1];
-    let straight = y[1] + u * (y[2] - y[1]);
-    let bent = u * (1.0 - u) * h[1] * ((1.0 - u) * (slope[0] - rise[1]) - u * (slope[1] - rise[1]));
+    let rise: [f64; AROUND - 1] = std::array::from_fn(|k| (y[k + 1] - y[k]) / h[k]);
+    let slope = [0, 1].map(|from| {
+        slopes.at(
+            std::array::from_fn(|k| h[from + k]),
+            std::array::from_fn(|k| rise[from + k]),
+        )
+    });
+    let u = (t - t_s[2]) / h[2];
+    let straight = y[2] + u * (y[3] - y[2]);
+    let bent = u * (1.0 - u) * h[2] * ((1.0 - u) * (slope[0] - rise[2]) - u * (slope[1] - rise[2]));
     Some((straight, straight + bent))
 }
 
@@ -99,7 +165,7 @@ fn parts(rows: usize) -> usize {
 
 /// The drive with some rows for each step. What surrounds the sensor goes in straight lines, a range flag stays until its next
 /// row.
-fn finer(drive: &Drive) -> Drive {
+fn finer(drive: &Drive, slopes: Slopes) -> Drive {
     let mut segments: Vec<Range<usize>> = Vec::with_capacity(drive.segments.len());
     let in_a_step = parts(drive.len());
     let mut places: Vec<(usize, usize)> = Vec::with_capacity(in_a_step * drive.len());
@@ -126,16 +192,11 @@ fn finer(drive: &Drive) -> Drive {
     for (rows, own) in segments.iter().zip(&drive.segments) {
         for place in rows.clone() {
             let (row, part) = places[place];
-            if part == 0 || row == own.start || row + 2 >= own.end {
+            if part == 0 || row < own.start + 2 || row + 3 >= own.end {
                 continue;
             }
-            let at = [row - 1, row, row + 1, row + 2];
-            let four = between(
-                at.map(|row| drive.t_s[row]),
-                at.map(|row| drive.reference[row]),
-                t_s[place],
-            );
-            if let Some((_, cubic)) = four {
+            let at = std::array::from_fn(|k| row + k - 2);
+            if let Some((_, cubic)) = between(drive, at, t_s[place], slopes) {
                 reference[place] = cubic;
             }
         }
@@ -231,5 +292,30 @@ mod tests {
 
         let steps = t_s.iter().map(|t| ((t / 3.7).floor() * 17.0) % 40.0);
         assert!(problem(t_s.clone(), steps.collect()).smoothed().is_none());
+    }
+
+    #[test]
+    fn a_kink_does_not_bend_the_steps_beside_it() {
+        // First-order low-passes of steps between the rows, as a switched load has them.
+        let wave = |t: f64| -> f64 {
+            let steps = [(1.03, 80.0), (3.97, -120.0), (8.25, 60.0), (12.5, -20.0)];
+            let after = |(at, size): (f64, f64)| size * (1.0 - (-(t - at).max(0.0) / 0.8).exp());
+            (0..20)
+                .flat_map(|turn| steps.map(|(at, size)| (at + 15.03 * f64::from(turn), size)))
+                .map(after)
+                .sum()
+        };
+        let t_s: Vec<f64> = (0..3000).map(|row| 0.1 * f64::from(row)).collect();
+        let reference = t_s.iter().map(|t| wave(*t)).collect();
+        let own = problem(t_s, reference);
+        assert_eq!(Bend::of(&own.drive).slopes, Slopes::Akima);
+        let error = |slopes| {
+            let smooth = own.bent(slopes).drive;
+            let squares = (0..smooth.len())
+                .map(|row| (smooth.reference[row] - wave(smooth.t_s[row])).powi(2));
+            (squares.sum::<f64>() / smooth.len() as f64).sqrt()
+        };
+        let [parabola, akima] = [Slopes::Parabola, Slopes::Akima].map(error);
+        assert!(akima < 0.8 * parabola, "{akima} {parabola}");
     }
 }
