@@ -444,7 +444,8 @@ fn promising(
         .collect()
 }
 
-fn added(model: &Model, member: Member) -> Model {
+/// The model with an effect, in the place of one of the same id.
+pub fn added(model: &Model, member: Member) -> Model {
     replaced(model, member.effect).with(member)
 }
 
@@ -1087,7 +1088,7 @@ fn rivals(
 
 /// Whether an effect can stand beside those of a model: it is not there, or it has more branches than what is there and takes that
 /// one's place as well.
-fn joins(model: &Model, effect: &'static dyn Effect) -> bool {
+pub fn joins(model: &Model, effect: &'static dyn Effect) -> bool {
     let card = effect.card();
     let same = model.members.iter().find(|member| member.id() == card.id);
     same.is_none_or(|member| card.parameters.len() > member.values.len())
@@ -1203,26 +1204,13 @@ fn name(
             let taken = share(bench, &without, now);
             // Where few rows decide, the difference of two models is never certain: who takes much less is no equal.
             let least = (EQUAL * taken).max(p99_of(step_p99, id));
-            let beside = beside(bench, now, index);
-            let between = |member: &Member| member.effect.card().stage.is_between_rows();
-            let stamped = if between(&now.model.members[index]) {
-                bench.stamped()
-            } else {
-                0.0
-            };
             let mut equivalent: Vec<&'static str> = others
                 .iter()
                 .filter(|(at, _)| *at == index)
                 .filter(|(_, other)| {
                     let last = other.model.members.len() - 1;
-                    let as_good = if between(&other.model.members[last]) {
-                        beside + stamped
-                    } else {
-                        beside
-                    };
                     share(bench, &without, other) >= least
-                        // What the other effects' equations, and uneven stamps, may be off by does not decide between two.
-                        && (apart(bench, &now.predicted, &other.predicted) < as_good || !beaten(bench, other, now))
+                        && does_as_well(bench, other, now, index)
                         // At the end of what is physics it cannot be named, and speaks against another's being certain.
                         && small(bench, &without, other, last, 1.0).is_none()
                 })
@@ -1246,6 +1234,16 @@ fn name(
             }
         })
         .collect()
+}
+
+/// Whether a model, whose last effect has the place of one of the chosen model, does as well as that one: what the other effects'
+/// equations, and uneven stamps, may be off by does not decide between two.
+pub fn does_as_well(bench: &Workbench<'_>, other: &Fit, chosen: &Fit, index: usize) -> bool {
+    let between = |member: &Member| member.effect.card().stage.is_between_rows();
+    let last = other.model.members.last();
+    let stamped = between(&chosen.model.members[index]) && last.is_some_and(between);
+    let may_be_off = beside(bench, chosen, index) + if stamped { bench.stamped() } else { 0.0 };
+    apart(bench, &chosen.predicted, &other.predicted) < may_be_off || !beaten(bench, other, chosen)
 }
 
 /// Whether a model's held-out loss is higher than the chosen one's by more than chance, stretch against stretch.
