@@ -65,7 +65,7 @@ pub struct Scene<'a> {
     pub steps: Arc<Steps>,
     /// Changes of the range, in order.
     pub changes: Arc<Vec<RangeChange>>,
-    /// The signal: on drive rows before [`super::Stage::Output`], then on the observation's rows.
+    /// The signal: on drive rows before [`super::Stage::Ripple`], then on the observation's rows.
     pub signal: Series,
     /// Transport delay in s.
     pub delay_s: f64,
