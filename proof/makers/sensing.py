@@ -1,7 +1,7 @@
 """Cases of the sensing chain, made by our own equations (kind d): no result on them alone is a headline.
 
 The equations follow the table of effects and are written anew here, not taken from the tool. What is concealed acts in the
-order in which a sensor has its parts: conductor, core, output of the sensor, clock, filter, converter, and noise before what
+order in which a sensor has its parts: conductor, core, sensitivity, zero, supply, clock, filter, converter, and noise before what
 the converter's output does. Each stretch begins after a long rest at its first value: filters settled, core demagnetised.
 """
 
@@ -196,16 +196,16 @@ EFFECTS: dict[str, Effect] = {
     "core-saturation": Effect(
         "rows", lambda k, r: {"knee_a": 600.0 / (1.0 + k), "softness": r.uniform(0.7, 1.5)}, core_saturation,
         lambda v: {"column": "i_ref_a", "from": v["knee_a"], "to": None, "absolute": True}),
-    "offset": Effect("rows", lambda k, r: {"offset_a": sign(r) * k}, lambda y, v, s: y + v["offset_a"]),
+    "sensor-self-heating": Effect(
+        "rows", lambda k, r: {"tc_per_a2": sign(r) * k * 1e-6, "tau_s": r.uniform(20.0, 80.0)}, self_heating),
     "gain": Effect("rows", lambda k, r: {"gain": 1.0 + sign(r) * k * 1e-3}, lambda y, v, s: y * v["gain"]),
-    "offset-temperature": Effect(
-        "rows", lambda k, r: {"tc_a_per_k": sign(r) * k * 0.1}, lambda y, v, s: y + v["tc_a_per_k"] * (s.temp_c - 25.0)),
     "gain-temperature": Effect(
         "rows", lambda k, r: {"tc_per_k": sign(r) * k * 1e-3},
         lambda y, v, s: y * (1.0 + v["tc_per_k"] * (s.temp_c - 25.0))),
+    "offset": Effect("rows", lambda k, r: {"offset_a": sign(r) * k}, lambda y, v, s: y + v["offset_a"]),
+    "offset-temperature": Effect(
+        "rows", lambda k, r: {"tc_a_per_k": sign(r) * k * 0.1}, lambda y, v, s: y + v["tc_a_per_k"] * (s.temp_c - 25.0)),
     "supply-ratiometric": Effect("rows", lambda k, r: {"ratio": sign(r) * k * 0.01}, supply_ratiometric),
-    "sensor-self-heating": Effect(
-        "rows", lambda k, r: {"tc_per_a2": sign(r) * k * 1e-6, "tau_s": r.uniform(20.0, 80.0)}, self_heating),
     "range-mismatch": Effect(
         "rows", lambda k, r: {"gain_ratio": 1.0 + sign(r) * k * 1e-3, "offset_a": sign(r) * k * 0.1}, range_mismatch,
         lambda v: {"column": "range_high", "from": 0.5, "to": None, "absolute": False}),

@@ -185,7 +185,8 @@ impl Parameter {
     }
 }
 
-/// Where in the chain from conductor to reading an effect acts. Effects are applied in this order.
+/// Where in the chain from conductor to reading an effect acts. Effects are applied in this order, in whatever order they were found or
+/// written down: what a value means must not depend on that. Those of one stage do the same in any order, or next to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Stage {
     /// What flows in, and beside, the conductor.
@@ -194,16 +195,32 @@ pub enum Stage {
     Core,
     /// What the core's flux is limited to.
     Saturation,
-    /// The sensor's sensitivity and zero.
-    Sensor,
+    /// What the current warms.
+    Heat,
+    /// The sensor's sensitivity: a reading is a factor times the current, and a zero error added to that.
+    Sensitivity,
+    /// The sensor's zero.
+    Zero,
+    /// What the supply does to both.
+    Supply,
+    /// The large sensor against the small one, each with its zero.
+    Range,
+    /// What a change from one to the other leaves behind.
+    HandOver,
     /// Time stamps: from when a reading is.
     Clock,
     /// Filters.
     Filter,
     /// The converter: windows and averages.
     Converter,
-    /// What is done to the reading at its own time stamps.
-    Output,
+    /// At the reading's own time stamps, as all that follows: what is added to it.
+    Ripple,
+    /// The ends of the output.
+    Rail,
+    /// What is too small to count.
+    Threshold,
+    /// The converter's steps.
+    Step,
     /// Charge that the battery takes and gives.
     BatteryCharge,
     /// The ohmic resistance at 25 °C, and what temperature does to the cell.
@@ -220,6 +237,11 @@ impl Stage {
     /// Whether effects of it work on what is between the rows.
     pub fn is_between_rows(self) -> bool {
         matches!(self, Self::Clock | Self::Filter | Self::Converter)
+    }
+
+    /// Whether effects of it change the reading at its own time stamps.
+    pub fn is_output(self) -> bool {
+        (Self::Ripple..=Self::Step).contains(&self)
     }
 }
 
@@ -242,6 +264,13 @@ pub struct Card {
     pub separated_by: &'static str,
     /// Where it acts.
     pub stage: Stage,
+}
+
+impl Card {
+    /// Its place in the order in which effects act: by stage, and within one by id.
+    pub fn place(&self) -> (Stage, &'static str) {
+        (self.stage, self.id)
+    }
 }
 
 /// A first-order filter, a linear drift or a branch of resistance and capacitance describes a real part to five percent.
@@ -659,6 +688,58 @@ mod tests {
             assert!(cell.0 != cell.1, "{id} did nothing");
             for (cell, pack) in cell.1.iter().zip(&pack.1) {
                 assert!((96.0 * cell - pack).abs() < 1e-9, "{id}: {cell}, {pack}");
+            }
+        }
+    }
+
+    /// Values must mean the same whichever effect was found, or written down, first.
+    #[test]
+    fn effects_act_in_one_order() {
+        let sensor = Base::Sensor(SensorBase {
+            full_scale: Some(60.0),
+            range_ratio: 10.0,
+            range_limit: Some(15.0),
+            ..SensorBase::default()
+        });
+        let problems = [
+            problem(View::Sensor, sensor, false),
+            problem(View::Voltage, battery(1.0), true),
+        ];
+        let scale = Scale {
+            full_scale: 60.0,
+            largest: 50.0,
+            rms: 25.0,
+            step_s: 0.5,
+            reading_step_s: 0.5,
+            span_s: 150.0,
+            capacity_ah: 2.0,
+            ..Scale::default()
+        };
+        let clues = Clues {
+            t_s: &[],
+            observed: &[],
+            predicted: &[],
+        };
+        for problem in &problems {
+            let effects: Vec<(&'static dyn Effect, Vec<f64>)> = LIBRARY
+                .iter()
+                .filter(|effect| effect.applies(problem))
+                .filter_map(|effect| {
+                    let start = effect.starts(&scale, &clues).pop()?;
+                    Some((*effect, start))
+                })
+                .collect();
+            assert!(effects.len() > 10);
+            for one in &effects {
+                for other in effects
+                    .iter()
+                    .filter(|other| other.0.card().id != one.0.card().id)
+                {
+                    let there = said(problem, &[one.clone(), other.clone()]);
+                    let back = said(problem, &[other.clone(), one.clone()]);
+                    let ids = [one, other].map(|(effect, _)| effect.card().id);
+                    assert_eq!(there, back, "{ids:?}");
+                }
             }
         }
     }

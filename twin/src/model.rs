@@ -290,7 +290,7 @@ impl Model {
             }
         }
         let mut effects = Vec::new();
-        // In the order of the file: a gain after an offset is not an offset after a gain.
+        // In the order of the file, which no physics follows from: effects act in the order of their stages.
         for id in places.order("effects") {
             if let Some(values) = parsed.effects.get(&id) {
                 let (id, values) = modelled(&id, values, &places)?;

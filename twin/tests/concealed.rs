@@ -227,6 +227,26 @@ fn both_at_once() {
     assert_eq!(ids, ["gain", "offset"], "{:?}", report.decisions);
 }
 
+/// What is told is `gain·i + offset`, whichever of the two is the larger and so found first.
+#[test]
+fn an_offset_beside_a_gain_is_what_is_added_to_the_reading() {
+    let truth = truth();
+    for (gain, offset) in [(1.02, -0.8), (1.01, 8.0)] {
+        let reading = truth.current_a.iter().map(|i| gain * i + offset).collect();
+        let report = explained(&truth, reading, 43, &[]);
+        let told = |id: &str| {
+            let effect = report.effects.iter().find(|effect| effect.id == id);
+            effect.unwrap().parameters[0].value
+        };
+        assert!((told("gain") - gain).abs() < 0.0005, "{:?}", report.effects);
+        assert!(
+            (told("offset") - offset).abs() < 0.025,
+            "{:?}",
+            report.effects
+        );
+    }
+}
+
 #[test]
 fn a_drift_with_temperature() {
     let truth = truth();

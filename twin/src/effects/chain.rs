@@ -228,7 +228,7 @@ impl<'a> Chain<'a> {
                     .map(|(index, (effect, values))| (*effect, *values, Some(index))),
             )
             .collect();
-        effects.sort_by_key(|(effect, _, _)| effect.card().stage);
+        effects.sort_by_key(|(effect, _, _)| effect.card().place());
         let mut next = effects.into_iter().peekable();
         let mut through = |order: &mut Vec<Link<'m>>, last: Stage| {
             while let Some((effect, values, index)) =

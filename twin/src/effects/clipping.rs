@@ -18,7 +18,7 @@ static CARD: Card = Card {
     shows: "flat tops",
     looks_like: &["core-saturation"],
     separated_by: "currents beyond the rail: the reading stays flat",
-    stage: Stage::Output,
+    stage: Stage::Rail,
 };
 
 impl Effect for Clipping {

@@ -15,7 +15,7 @@ static CARD: Card = Card {
     shows: "only for abs(i) below the threshold",
     looks_like: &["quantisation"],
     separated_by: "a slow ramp of the current through zero",
-    stage: Stage::Output,
+    stage: Stage::Threshold,
 };
 
 impl Effect for DeadBand {

@@ -15,7 +15,7 @@ static CARD: Card = Card {
     shows: "grows with abs(i)",
     looks_like: &["capacity"],
     separated_by: "currents of several sizes against a reference current",
-    stage: Stage::Sensor,
+    stage: Stage::Sensitivity,
 };
 
 impl Effect for Gain {

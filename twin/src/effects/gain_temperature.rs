@@ -16,7 +16,7 @@ static CARD: Card = Card {
     shows: "abs(i) times temperature",
     looks_like: &["gain"],
     separated_by: "the same large current at two temperatures",
-    stage: Stage::Sensor,
+    stage: Stage::Sensitivity,
 };
 
 impl Effect for GainTemperature {

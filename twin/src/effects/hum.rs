@@ -20,7 +20,7 @@ static CARD: Card = Card {
     shows: "a spectral line",
     looks_like: &[],
     separated_by: "a rest: the line stays",
-    stage: Stage::Output,
+    stage: Stage::Ripple,
 };
 
 impl Effect for Hum {

@@ -15,7 +15,7 @@ static CARD: Card = Card {
     shows: "everywhere, strongest at rest; charge ramps",
     looks_like: &["coulombic-efficiency", "parasitic-load"],
     separated_by: "a rest of a minute with a reference current of zero",
-    stage: Stage::Sensor,
+    stage: Stage::Zero,
 };
 
 impl Effect for Offset {

@@ -16,7 +16,7 @@ static CARD: Card = Card {
     shows: "follows the temperature of the sensor",
     looks_like: &["offset"],
     separated_by: "the same current at two temperatures, warming and cooling",
-    stage: Stage::Sensor,
+    stage: Stage::Zero,
 };
 
 impl Effect for OffsetTemperature {

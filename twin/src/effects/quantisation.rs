@@ -16,7 +16,7 @@ static CARD: Card = Card {
     shows: "staircase, bounded error",
     looks_like: &["dead-band"],
     separated_by: "a slow ramp of the current",
-    stage: Stage::Output,
+    stage: Stage::Step,
 };
 
 impl Effect for Quantisation {

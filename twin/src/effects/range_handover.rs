@@ -19,7 +19,7 @@ static CARD: Card = Card {
     shows: "at each change of the range flag",
     looks_like: &[],
     separated_by: "many changes of range at a large current",
-    stage: Stage::Sensor,
+    stage: Stage::HandOver,
 };
 
 impl Effect for RangeHandover {

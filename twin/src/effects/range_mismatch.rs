@@ -19,7 +19,7 @@ static CARD: Card = Card {
     shows: "differs by range flag",
     looks_like: &["gain", "offset"],
     separated_by: "currents in both ranges, of both signs",
-    stage: Stage::Sensor,
+    stage: Stage::Range,
 };
 
 impl Effect for RangeMismatch {

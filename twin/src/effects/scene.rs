@@ -67,7 +67,7 @@ pub struct Scene<'a> {
     on_rows: Arc<Vec<bool>>,
     /// Changes of the range, in order.
     pub changes: Arc<Vec<RangeChange>>,
-    /// The signal: on drive rows before [`super::Stage::Output`], then on the observation's rows.
+    /// The signal: on drive rows before [`super::Stage::Ripple`], then on the observation's rows.
     pub signal: Series,
     /// Transport delay in s.
     pub delay_s: f64,

@@ -27,7 +27,7 @@ static CARD: Card = Card {
     shows: "slow, after load",
     looks_like: &["gain-temperature", "gain"],
     separated_by: "a long large current after a long rest",
-    stage: Stage::Sensor,
+    stage: Stage::Heat,
 };
 
 impl Effect for SensorSelfHeating {

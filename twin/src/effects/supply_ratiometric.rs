@@ -21,7 +21,7 @@ static CARD: Card = Card {
     shows: "follows the supply of the sensor",
     looks_like: &["offset"],
     separated_by: "a sweep of the supply at a constant current",
-    stage: Stage::Sensor,
+    stage: Stage::Supply,
 };
 
 impl Effect for SupplyRatiometric {

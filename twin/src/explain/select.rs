@@ -11,7 +11,7 @@ use super::shape::without_memory;
 use super::slope::change;
 use super::told::short;
 use super::workbench::{Member, Model, Workbench};
-use crate::effects::{Effect, Search, Stage, find};
+use crate::effects::{Effect, Search, find};
 
 /// Effects in one model at most.
 const MOST_EFFECTS: usize = 6;
@@ -697,7 +697,7 @@ fn small(
         ));
     }
     let noise = to / rows;
-    if card.stage == Stage::Output
+    if card.stage.is_output()
         && card
             .parameters
             .iter()

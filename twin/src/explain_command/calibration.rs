@@ -99,7 +99,12 @@ pub(super) fn calibrate(model: &Model, report: &Report) -> Calibration {
         });
         let had = had.map(|effect| (effect, false));
         let named = named.cloned().map(|effect| (effect, true));
-        for ((id, parameters), is_new) in had.chain(named) {
+        // In the order in which they act, whenever they were found.
+        let mut all: Vec<_> = had.chain(named).collect();
+        all.sort_by_key(|((id, parameters), _)| {
+            find_with(id, parameters.len()).map(|effect| effect.card().place())
+        });
+        for ((id, parameters), is_new) in all {
             let remedy = remedy(model, signal, &id, &parameters.into_iter().collect());
             let said = report
                 .effects
@@ -335,11 +340,15 @@ mod tests {
             let values = values
                 .iter()
                 .map(|(name, value)| ((*name).to_owned(), *value));
-            report.models.push(FittedModel {
-                signal: (*signal).to_owned(),
-                effects: vec![((*id).to_owned(), values.collect())],
-                ..FittedModel::default()
-            });
+            let effect = ((*id).to_owned(), values.collect());
+            match report.models.last_mut() {
+                Some(model) if model.signal == *signal => model.effects.push(effect),
+                _ => report.models.push(FittedModel {
+                    signal: (*signal).to_owned(),
+                    effects: vec![effect],
+                    ..FittedModel::default()
+                }),
+            }
         }
         let calibration = calibrate(&model, &report);
         let table: toml::Table = calibration.text.unwrap_or_default().parse().unwrap();
@@ -384,6 +393,20 @@ mod tests {
             Some(-700_000)
         );
         assert!(remarks.is_empty(), "{remarks:?}");
+    }
+
+    /// A gain and an offset are `gain·i + offset`, whichever was found first.
+    #[test]
+    fn a_zero_is_corrected_as_it_is_read() {
+        let (gain, offset) = ([("gain", 1.25)], [("offset_a", 0.5)]);
+        for effects in [
+            [("i_meas_a", "gain", &gain), ("i_meas_a", "offset", &offset)],
+            [("i_meas_a", "offset", &offset), ("i_meas_a", "gain", &gain)],
+        ] {
+            let (values, _) = found(&effects.map(|(signal, id, values)| (signal, id, &values[..])));
+            // z/s of y = s·i + z.
+            assert_eq!(values["zero drift"]["small"].as_integer(), Some(400_000));
+        }
     }
 
     #[test]
