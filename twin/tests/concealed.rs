@@ -227,6 +227,24 @@ fn both_at_once() {
     assert_eq!(ids, ["gain", "offset"], "{:?}", report.decisions);
 }
 
+/// Slips of the log are told, and take no name back that has nothing to do with them.
+#[test]
+fn a_gain_beside_slips_of_the_log() {
+    let truth = truth();
+    let mut reading: Vec<f64> = truth.current_a.iter().map(|i| 1.02 * i).collect();
+    for (row, by_a) in [(1700, -44.0), (4000, 94.0), (7200, 61.0)] {
+        reading[row] += by_a;
+    }
+    let report = explained(&truth, reading, 44, &[]);
+    let ids: Vec<&str> = report.effects.iter().map(|e| e.id.as_str()).collect();
+    assert_eq!(ids, ["gain"], "{:?}", report.decisions);
+    assert!((report.effects[0].parameters[0].value - 1.02).abs() < 1e-3);
+    // What they are is left, and said.
+    assert_eq!(report.verdict, Verdict::PartlyExplained);
+    let slips = |remark: &String| remark.contains("3 readings are off by more than 8 times");
+    assert!(report.remarks.iter().any(slips), "{:?}", report.remarks);
+}
+
 /// What is told is `gain·i + offset`, whichever of the two is the larger and so found first.
 #[test]
 fn an_offset_beside_a_gain_is_what_is_added_to_the_reading() {

@@ -67,10 +67,11 @@ pub(super) fn judge(
     if selection.named.is_empty() {
         return without_names(bench, selection, before);
     }
-    let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
-    let rest = energy(&selection.fit);
+    let slips = slipped(bench, &selection.plain, &selection.fit);
+    let energy = |residual: &[f64]| without_rows(residual, &slips);
+    let rest = energy(&selection.fit.residual);
     let quiet = noise * noise * count;
-    let explained = energy(&selection.plain) - rest + (unavoidable - quiet);
+    let explained = energy(&selection.plain.residual) - rest + (unavoidable - quiet);
     let smooth = if left.is_real() && left.share > LEFT {
         left.share * rest
     } else {
@@ -87,11 +88,11 @@ pub(super) fn judge(
         }
     };
     let beyond = louder(rest, unavoidable, bench.coloured());
+    // Slips of the log speak against no name, and are left all the same.
+    let all = dot(&selection.fit.residual, &selection.fit.residual);
+    let loud = louder(all, unavoidable, bench.coloured()) > 0.0;
     // A drift that is slower than the stated noise hides in it once that was made white: not as it was read.
-    let seen = |fit: &Fit| {
-        let as_read = bench.as_read(&fit.residual);
-        dot(&as_read, &as_read)
-    };
+    let seen = |fit: &Fit| energy(&bench.as_read(&fit.residual));
     let rest_read = seen(&selection.fit);
     // As a share of what the named effects take.
     let drift = if bench.is_white() {
@@ -108,14 +109,14 @@ pub(super) fn judge(
             percent(smooth / explained.max(1e-300))
         ));
     }
-    if beyond > 0.0 || drift > 0.0 {
-        let loud = if beyond > 0.0 { rest } else { rest_read };
+    if beyond > 0.0 || drift > 0.0 || loud {
+        let loud = if loud { all } else { rest_read };
         selection.decisions.push(format!(
             "What remains is {} times the noise that the model file states.",
             short((loud / unavoidable).sqrt())
         ));
     }
-    if smooth > 0.0 || beyond > 0.0 || drift > 0.0 {
+    if smooth > 0.0 || beyond > 0.0 || drift > 0.0 || loud {
         // What the model file's own equations may be off by is no sign of another physics.
         let ratio = (smooth.max(beyond) - bench.modelled).max(0.0) / explained.max(1e-300);
         let ratio = ratio.max(drift);
@@ -146,6 +147,32 @@ pub(super) fn judge(
     } else {
         Verdict::Explained
     }
+}
+
+/// Single readings that are off by what no noise makes and no named effect can: more than all of them change there. They are rare, and no
+/// few in a row, so that they are slips of the log, or come of what has nothing to do with the names.
+fn slipped(bench: &Workbench<'_>, plain: &Fit, fit: &Fit) -> Vec<usize> {
+    // Behind what cuts or rounds, noise is not what the model file states.
+    let cuts = |member: &Member| member.effect.cuts();
+    if bench.problem.noise <= 0.0 || fit.model.members.iter().any(cuts) {
+        return Vec::new();
+    }
+    let Some(strays) = strays(bench, &fit.residual) else {
+        return Vec::new();
+    };
+    if strays.in_a_row >= IN_A_ROW || strays.rows.len() as f64 > RARE * bench.len() as f64 {
+        return Vec::new();
+    }
+    let by_effects = |row: usize| (fit.predicted[row] - plain.predicted[row]).abs();
+    let mut rows = strays.rows;
+    rows.retain(|&row| fit.residual[row].abs() > by_effects(row));
+    rows
+}
+
+/// Energy of a series but for some of its rows.
+fn without_rows(series: &[f64], rows: &[usize]) -> f64 {
+    let taken: f64 = rows.iter().map(|&row| series[row].powi(2)).sum();
+    (dot(series, series) - taken).max(0.0)
 }
 
 /// The verdict where nothing is named: whether something is left all the same, and what tells it.
@@ -254,6 +281,8 @@ struct Strays {
     /// The largest of them, in the view's unit, and its time in s.
     largest: f64,
     at_s: f64,
+    /// So many follow one another, all to one side.
+    in_a_row: usize,
     /// Whether they are the mismatch: most of it, or so many in a row that it is no slip of the log.
     decide: bool,
 }
@@ -297,6 +326,7 @@ fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
     Some(Strays {
         largest: residual[largest].abs(),
         at_s: bench.t_s[largest],
+        in_a_row,
         decide: (rows.len() >= least && energy > share * all) || (stated && in_a_row >= IN_A_ROW),
         rows,
     })
@@ -413,7 +443,8 @@ pub(super) fn doubt(
     if (confirmed && not_there.is_none()) || selection.named.is_empty() {
         return (verdict, None);
     }
-    let energy = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
+    let slips = slipped(bench, &selection.plain, &selection.fit);
+    let energy = |fit: &Fit| without_rows(&fit.residual, &slips);
     let rest = energy(&selection.fit);
     let explained = (energy(&selection.plain) - rest).max(1e-300);
     let wavers = intervals::variations(bench, &selection.fit)
