@@ -434,7 +434,7 @@ pub(super) fn doubt(
             "its values would have to differ from stretch to stretch by",
         ),
         (
-            left.share * rest / explained,
+            left.there() * rest / explained,
             left.is_real(),
             "what is left within reach of the inputs is",
         ),
