@@ -625,6 +625,33 @@ fn a_drift_or_a_side_is_no_hysteresis() {
     }
 }
 
+/// What wanders beside a sensitivity error, by a fifth of what single readings vary by, and follows nothing that was recorded: the noise
+/// that the model file states has no memory, so something else is there, too.
+#[test]
+fn what_stated_noise_would_not_leave_is_doubted() {
+    let truth = truth_of("25c-hwfet.csv");
+    let times = truth.t_s.iter();
+    let wander: Vec<f64> = times
+        .map(|t| 0.11 * ((t / 5.3).sin() + (t / 3.1 + 0.4 * (t / 11.0).sin()).sin()))
+        .collect();
+    let reading: Vec<f64> = truth.current_a.iter().map(|i| 1.02 * i).collect();
+    for (seed, wanders) in [(43, true), (44, true), (43, false), (44, false)] {
+        let reading = if wanders {
+            plus(&reading, &wander)
+        } else {
+            reading.clone()
+        };
+        let report = explained(&truth, reading, seed, &[]);
+        assert_named(&report, "gain", &[("gain", 1.02, 0.002)]);
+        let expected = if wanders {
+            Verdict::Ambiguous
+        } else {
+            Verdict::Explained
+        };
+        assert_eq!(report.verdict, expected, "{:?}", report.decisions);
+    }
+}
+
 /// Noise that wanders for half a minute, a little white noise beside it.
 const SLOW: Coloured = Coloured {
     rms: 0.48,

@@ -26,12 +26,20 @@ pub struct Explainable {
     pub share: f64,
     /// The largest of the placebos' shares.
     pub placebo_most: f64,
+    /// Their mean.
+    pub placebo_mean: f64,
 }
 
 impl Explainable {
     /// More than chance.
     pub fn is_real(&self) -> bool {
         self.share > self.placebo_most && self.share > 0.0
+    }
+
+    /// The share that is there. So many weights, each found in noise, cost something on data that they were not found on: what
+    /// placebos lose, in which there is nothing to be found.
+    pub fn there(&self) -> f64 {
+        self.share - self.placebo_mean.min(0.0)
     }
 }
 
@@ -185,6 +193,7 @@ impl Features {
             placebo_most: shares[1..]
                 .iter()
                 .fold(0.0, |most, share| f64::max(most, *share)),
+            placebo_mean: shares[1..].iter().sum::<f64>() / DRAWS as f64,
         }
     }
 
@@ -346,4 +355,68 @@ fn columns(bench: &Workbench<'_>, rows: &[usize]) -> Vec<Vec<f64>> {
         }
     }
     columns
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
+    use rand_distr::{Distribution as _, StandardNormal};
+
+    const ROWS: usize = 3600;
+    const SEEDS: u64 = 12;
+
+    #[test]
+    fn what_is_there_is_not_less_for_the_weights_that_are_tried() {
+        let t_s: Vec<f64> = (0..ROWS).map(|row| 0.5 * row as f64).collect();
+        let drawn = |seed: u64| StandardNormal.sample_iter(ChaCha8Rng::seed_from_u64(seed));
+        let steps: Vec<f64> = drawn(0).take(ROWS).collect();
+        // It wanders for some ten rows, and never in the same way again.
+        let current: Vec<f64> = steps
+            .iter()
+            .scan(0.0, |current, step: &f64| {
+                *current = 0.9 * *current + 20.0 * step;
+                Some(*current)
+            })
+            .collect();
+        let problem = Problem {
+            view: View::Sensor,
+            name: "i_meas_a".into(),
+            unit: "A".into(),
+            observed: Observed::with_drive(t_s.clone(), current.clone()),
+            drive: Drive {
+                segments: std::iter::once(0..ROWS).collect(),
+                continues: vec![false],
+                reference: current.clone().into(),
+                t_s: t_s.into(),
+                ..Drive::default()
+            },
+            base: Base::Sensor(SensorBase::default()),
+            modelled: Vec::new(),
+            noise: 1.0,
+            coloured: Coloured::default(),
+            accuracy: Accuracy::default(),
+        };
+        let features = Features::new(&Workbench::new(&problem, &[]));
+        let size = (dot(&current, &current) / ROWS as f64).sqrt();
+        for share in [0.04_f64, 0.08] {
+            let follows = (share / (1.0 - share)).sqrt() / size;
+            let found = (1..=SEEDS).map(|seed| {
+                let noise = drawn(seed).take(ROWS);
+                let both = current.iter().zip(noise);
+                let residual: Vec<f64> = both
+                    .map(|(i, noise): (_, f64)| follows * i + noise)
+                    .collect();
+                let left = features.explain(&residual, seed);
+                assert!(left.is_real(), "{left:?}");
+                [left.there(), left.share]
+            });
+            let sums = found.fold([0.0, 0.0], |[there, alone], [a, b]| [there + a, alone + b]);
+            let [there, alone] = sums.map(|sum| sum / SEEDS as f64);
+            // A share of so many rows has a standard error of 2·√(share/rows).
+            let error = 2.0 * (share / (SEEDS * ROWS as u64) as f64).sqrt();
+            assert!((there - share).abs() < 4.0 * error, "{share}: {there}");
+            assert!(alone < share - 4.0 * error, "{share}: {alone}");
+        }
+    }
 }
