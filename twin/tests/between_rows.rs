@@ -172,7 +172,7 @@ fn a_kink_does_not_bend_what_is_beside_it() {
 #[test]
 fn noise_of_the_reference_is_no_time_of_the_sensor() {
     for seed in 0..3 {
-        let current = blunted_steps(seed);
+        let current = blunted_steps(seed, 2.0);
         let rows = || (0..ROWS).map(|row| current[row * FINE]);
         let noisy = |seed: u64, noise_a: f64| -> Vec<f64> {
             let mut noise = noise(seed, noise_a);
