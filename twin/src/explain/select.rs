@@ -5,7 +5,6 @@ use rayon::prelude::*;
 use super::fit::{Fit, fit, polish};
 use super::held_out::held_out;
 use super::normal::dot;
-use super::quieter::only_quietens;
 use super::robust::{huber, loss};
 use super::screen::{DRAWS, Entry, Screening, replaced, screen};
 use super::shape::without_memory;
@@ -594,9 +593,7 @@ fn step(
             );
             continue;
         }
-        let why = obstacle(bench, now, &better, index, gain)
-            .or_else(|| quietens(bench, now, &better, index));
-        match why {
+        match obstacle(bench, now, &better, index, gain) {
             Some(why) => note(refused, format!("{id}: {why}")),
             None => {
                 decisions.push(format!(
@@ -769,16 +766,6 @@ fn size_beside(bench: &Workbench<'_>, residual: &[f64], model: &Model, index: us
     (all, share(size, seen))
 }
 
-/// Why what works between the rows, the effects from an index on, is no time of the sensor's.
-fn quietens(bench: &Workbench<'_>, before: &Fit, after: &Fit, from: usize) -> Option<String> {
-    let mut added = after.model.members[from..].iter();
-    let between = added.any(|member| member.effect.card().stage.is_between_rows());
-    (between && only_quietens(bench, before, after)).then(|| {
-        "evens out what the reference does from row to row, and does not show where the current moves"
-            .into()
-    })
-}
-
 /// What of an effect's values would be at the end of what is physics.
 pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
     let card = member.effect.card();
@@ -945,9 +932,6 @@ fn unfit(
     }
     if single.is_some_and(|single| share(bench, single, best) < MUCH) {
         return Some("not much better than one effect alone".into());
-    }
-    if let Some(why) = quietens(bench, now, best, count - 2) {
-        return Some(why);
     }
     // Each of the two has to be missed.
     (count - 2..count).find_map(|index| {
