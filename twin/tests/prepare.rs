@@ -219,28 +219,6 @@ fn a_held_value_that_stays_the_same_was_measured_again() {
     assert!((30..=51).contains(&inside), "{inside}");
 }
 
-/// Of a reading that came out the same twice in steps, the second counts where it was made: the current that moves on while it is
-/// held is none of it.
-#[test]
-fn a_held_value_that_came_again_counts_at_its_own_row() {
-    // A new reading every third row, in whole steps; it comes again once in a while.
-    let reading = |row: u32| {
-        let made = row / 3;
-        let same_again = if made % 7 == 3 { made - 1 } else { made };
-        f64::from(same_again * same_again % 101)
-    };
-    let rows = (0..3000).map(|row| {
-        let current = 50.0 + 50.0 * (0.7 * f64::from(row)).sin();
-        vec![0.1 * f64::from(row), current, reading(row)]
-    });
-    let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
-    let counted = (0..3000).filter(|row| problem.observed.valid[*row as usize]);
-    assert!(counted.clone().count() > 950);
-    for row in counted {
-        assert_eq!(row % 3, 0, "row {row}");
-    }
-}
-
 #[test]
 fn clipping_and_a_dead_band_are_no_holding() {
     let clipped = (0..400).map(|k| {

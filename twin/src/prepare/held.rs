@@ -127,32 +127,18 @@ pub fn freshness(
         }
         interval_s
     };
-    // A value that stays longer was measured again and came out the same: once for each interval, and counted at the row at which it
-    // was due. Where it has stayed for so long that this is certain, the current may have moved on since.
+    // A value that stays longer was measured again and came out the same: once for each interval.
     let mut last_fresh = f64::NEG_INFINITY;
     before_row = usize::MAX;
-    let mut due = 0;
-    let early = |row: usize, last_s: f64| (t_s[row] - last_s - interval_s).abs();
     for (before, after) in pairs() {
         if before != before_row {
             last_fresh = t_s[before];
-            due = after;
         }
         before_row = after;
-        if !same(before, after) {
+        let since = t_s[after] - last_fresh;
+        if !same(before, after) || since >= AGAIN * interval_s {
             fresh[after] = true;
             last_fresh = t_s[after];
-            due = after;
-            continue;
-        }
-        // From the row that is new itself it goes to the first after it, and on as long as that is nearer.
-        if t_s[due] <= last_fresh || early(after, last_fresh) < early(due, last_fresh) {
-            due = after;
-        }
-        if t_s[after] - last_fresh >= AGAIN * interval_s {
-            fresh[due] = true;
-            last_fresh = t_s[due];
-            due = after;
         }
     }
     Freshness {
