@@ -168,7 +168,6 @@ fn a_kink_does_not_bend_what_is_beside_it() {
     }
 }
 
-<<<<<<< HEAD
 #[test]
 fn a_delay_hides_neither_a_gain_nor_an_offset() {
     for seed in 0..6 {
