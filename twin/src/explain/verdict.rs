@@ -472,7 +472,7 @@ pub(super) fn doubt(
             "what is left within reach of the inputs is",
         ),
         (
-            remembered(bench, &selection.fit) / explained,
+            remembered(bench, &selection.fit, &slips) / explained,
             true,
             "what is left from reading to reading, and the stated noise would not leave, is",
         ),
@@ -537,8 +537,9 @@ fn beyond(bench: &Workbench<'_>, rest: f64, unavoidable: f64) -> f64 {
 }
 
 /// Energy of what is left with a memory that the stated noise has not: of means of so many readings in a row, beyond what the noise
-/// makes of them. Slow and small, it hides in the noise of single readings, and no input that was recorded need follow it.
-fn remembered(bench: &Workbench<'_>, fit: &Fit) -> f64 {
+/// makes of them. Slow and small, it hides in the noise of single readings, and no input that was recorded need follow it. A slip of the
+/// log is no memory, though it is in a mean.
+fn remembered(bench: &Workbench<'_>, fit: &Fit, slips: &[usize]) -> f64 {
     let noise = bench.problem.noise;
     // Behind what cuts or rounds, noise is not what the model file states; and a memory that it states hides another.
     let cuts = |member: &Member| member.effect.cuts();
@@ -550,6 +551,8 @@ fn remembered(bench: &Workbench<'_>, fit: &Fit) -> f64 {
         scatter: 0.0,
         ..bench.problem.accuracy
     };
+    let mut residual = fit.residual.clone();
+    slips.iter().for_each(|&row| residual[row] = 0.0);
     let rows: Vec<usize> = (0..bench.len()).collect();
     let widths = std::iter::successors(Some(2), |width| Some(2 * width));
     widths
@@ -559,7 +562,7 @@ fn remembered(bench: &Workbench<'_>, fit: &Fit) -> f64 {
             let (mut energy, mut expected, mut variance) = (0.0, 0.0, 0.0);
             for rows in rows.chunks_exact(width) {
                 let (from, count) = (rows[0], width as f64);
-                let sum: f64 = fit.residual[from..from + width].iter().sum();
+                let sum: f64 = residual[from..from + width].iter().sum();
                 let by_noise = noise * noise * count + bench.rounded(from, &ones);
                 let together: f64 = rows
                     .iter()
