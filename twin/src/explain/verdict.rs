@@ -1,13 +1,14 @@
 //! The verdict on one signal: what a true model would leave, what is left, and what that says of the names.
 
-use super::fit::Fit;
+use super::fit::{self, Fit};
 use super::flexible::{Explainable, Features};
 use super::normal::dot;
+use super::quieter::only_quietens;
 use super::robust::spread;
 use super::select::{self, Selection, percent};
 use super::slope::change;
 use super::told::short;
-use super::workbench::{Member, Workbench};
+use super::workbench::{Member, Model, Workbench};
 use super::{Held, intervals, jumps, rms};
 use crate::effects::scene::range_changes;
 use crate::problem::{Accuracy, Base, Coloured};
@@ -495,6 +496,7 @@ pub(super) fn doubt(
     }
     let elsewhere = not_there.as_ref().map_or(0.0, |(share, _)| *share);
     doubts.extend(not_there.map(|(_, text)| text));
+    doubts.extend(quietening(bench, &selection.fit));
     if doubts.is_empty() {
         return (verdict, None);
     }
@@ -508,6 +510,29 @@ pub(super) fn doubt(
         .map(|(share, ..)| *share)
         .fold(elsewhere, f64::max);
     (Verdict::Ambiguous, Some(most * explained))
+}
+
+/// What is to be said of effects between the rows that noise of the reference would look the same as. All of them are asked together: of
+/// two that even it out, one does what the other is taken out for.
+fn quietening(bench: &Workbench<'_>, fit: &Fit) -> Option<String> {
+    let members = fit.model.members.iter();
+    let (between, others): (Vec<&Member>, Vec<&Member>) =
+        members.partition(|member| member.effect.card().stage.is_between_rows());
+    if between.is_empty() {
+        return None;
+    }
+    let without = Model {
+        members: others.into_iter().cloned().collect(),
+        ..fit.model.clone()
+    };
+    let without = fit::fit(bench, &without, None);
+    only_quietens(bench, &without, fit).then(|| {
+        let ids: Vec<&str> = between.iter().map(|member| member.id()).collect();
+        format!(
+            "{} evens out what the reference does from row to row and does not show where it moves, as if that were noise of the reference",
+            ids.join(" with ")
+        )
+    })
 }
 
 /// Energy by which values that were found in a part of the recording miss the other part, beyond what the fit leaves; and whether

@@ -486,6 +486,11 @@ impl<'a> Workbench<'a> {
         self.thinned(self.everywhere(model))
     }
 
+    /// The simulation of another chain with the same readings, at the rows that count.
+    pub(super) fn run_on(&self, chain: &Chain<'_>, model: &Model) -> Vec<f64> {
+        self.thinned(chain.run(&members(model), &model.nuisance))
+    }
+
     /// The simulation up to a member; see [`Chain::begin`].
     pub fn begin(&self, model: &Model, member: usize) -> Begun<'a> {
         self.chain.begin(&members(model), &model.nuisance, member)
