@@ -301,6 +301,29 @@ impl Problem {
     pub fn quasi_static(&self) -> bool {
         matches!(&self.base, Base::Sensor(base) if base.quasi_static)
     }
+
+    /// A sensor beside its reference in one stretch, both in A and read in the same rows, with white noise of an rms.
+    #[cfg(test)]
+    pub(crate) fn pair(t_s: Vec<f64>, reference: Vec<f64>, reading: Vec<f64>, noise: f64) -> Self {
+        Self {
+            view: View::Sensor,
+            name: "i_meas_a".into(),
+            unit: "A".into(),
+            observed: Observed::with_drive(t_s.clone(), reading),
+            drive: Drive {
+                segments: std::iter::once(0..t_s.len()).collect(),
+                continues: vec![false],
+                reference: reference.into(),
+                t_s: t_s.into(),
+                ..Drive::default()
+            },
+            base: Base::Sensor(SensorBase::default()),
+            modelled: Vec::new(),
+            noise,
+            coloured: Coloured::default(),
+            accuracy: Accuracy::default(),
+        }
+    }
 }
 
 impl Drive {

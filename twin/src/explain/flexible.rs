@@ -360,7 +360,7 @@ fn columns(bench: &Workbench<'_>, rows: &[usize]) -> Vec<Vec<f64>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
+    use crate::problem::Problem;
     use rand_distr::{Distribution as _, StandardNormal};
 
     const ROWS: usize = 3600;
@@ -379,24 +379,7 @@ mod tests {
                 Some(*current)
             })
             .collect();
-        let problem = Problem {
-            view: View::Sensor,
-            name: "i_meas_a".into(),
-            unit: "A".into(),
-            observed: Observed::with_drive(t_s.clone(), current.clone()),
-            drive: Drive {
-                segments: std::iter::once(0..ROWS).collect(),
-                continues: vec![false],
-                reference: current.clone().into(),
-                t_s: t_s.into(),
-                ..Drive::default()
-            },
-            base: Base::Sensor(SensorBase::default()),
-            modelled: Vec::new(),
-            noise: 1.0,
-            coloured: Coloured::default(),
-            accuracy: Accuracy::default(),
-        };
+        let problem = Problem::pair(t_s, current.clone(), current.clone(), 1.0);
         let features = Features::new(&Workbench::new(&problem, &[]));
         let size = (dot(&current, &current) / ROWS as f64).sqrt();
         for share in [0.04_f64, 0.08] {

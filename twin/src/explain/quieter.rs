@@ -17,8 +17,10 @@ use crate::problem::{Drive, Observed, Problem, Series};
 const BESIDE: f64 = 5.0;
 /// The instrument shows an effect from so many standard deviations on.
 const SHOWN: f64 = 2.0;
-/// Where it shows less than half of it by more than so many, that is not it.
-const DOUBT: f64 = 1.0;
+/// What it shows is the effect if it is this share of it,
+const LEAST: f64 = 0.5;
+/// but for so many standard deviations.
+const CHANCE: f64 = 1.0;
 /// Parts of the recording over which the spread is told.
 const PARTS: usize = 200;
 
@@ -50,17 +52,16 @@ fn borne_out(residual: &[f64], change: &[f64], instrument: &[f64], weights: &[f6
     let there = shown / all;
     let each = change.len().div_ceil(PARTS).max(1);
     let variance: f64 = rows
-        .collect::<Vec<usize>>()
-        .chunks(each)
-        .map(|rows| {
-            let left = rows
-                .iter()
-                .map(|&row| score(row, residual[row] - there * change[row]));
+        .clone()
+        .step_by(each)
+        .map(|from| {
+            let part = from..rows.end.min(from + each);
+            let left = part.map(|row| score(row, residual[row] - there * change[row]));
             left.sum::<f64>().powi(2)
         })
         .sum();
     let error = variance.sqrt() / all.abs();
-    there > SHOWN * error && there > 0.5 - DOUBT * error
+    there > SHOWN * error && there > LEAST - CHANCE * error
 }
 
 /// The problem with a mean of the reference over so much to each side, less near an end of a stretch.
@@ -123,7 +124,6 @@ mod tests {
     use crate::effects::find;
     use crate::explain::fit::fit;
     use crate::explain::workbench::Member;
-    use crate::problem::{Accuracy, Base, Coloured, SensorBase, View};
 
     const STEP_S: f64 = 0.1;
     const WINDOW_S: f64 = 0.5;
@@ -150,24 +150,11 @@ mod tests {
         let noise = |t: f64, by: f64| 0.4 * (by * t * t).sin();
         let reference = |t: &f64| current(*t, false) + noise(*t, 9973.0);
         let reading = |t: &f64| current(*t, true) + noise(*t, 7919.0);
-        Problem {
-            view: View::Sensor,
-            name: "i_meas_a".into(),
-            unit: "A".into(),
-            observed: Observed::with_drive(t_s.clone(), t_s.iter().map(reading).collect()),
-            drive: Drive {
-                segments: std::iter::once(0..t_s.len()).collect(),
-                continues: vec![false],
-                reference: t_s.iter().map(reference).collect::<Vec<f64>>().into(),
-                t_s: t_s.into(),
-                ..Drive::default()
-            },
-            base: Base::Sensor(SensorBase::default()),
-            modelled: Vec::new(),
-            noise: 0.4,
-            coloured: Coloured::default(),
-            accuracy: Accuracy::default(),
-        }
+        let (reference, reading) = (
+            t_s.iter().map(reference).collect(),
+            t_s.iter().map(reading).collect(),
+        );
+        Problem::pair(t_s, reference, reading, 0.4)
     }
 
     #[test]

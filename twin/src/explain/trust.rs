@@ -264,9 +264,7 @@ fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<Stri
 #[allow(clippy::unwrap_used, clippy::expect_used)]
 mod tests {
     use super::*;
-    use crate::problem::{
-        Accuracy, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, View,
-    };
+    use crate::problem::{Accuracy, BatteryBase, Coloured, Drive, Observed, Problem, View};
 
     #[test]
     fn what_a_recording_does_not_tell_is_told_from_what_it_does() {
@@ -333,24 +331,8 @@ mod tests {
             let read = i.abs().min(60.0) + beyond / (1.0 + beyond / (softness * 60.0));
             read.copysign(*i) + noise
         });
-        Problem {
-            view: View::Sensor,
-            name: "i_meas_a".into(),
-            unit: "A".into(),
-            observed: Observed::with_drive(t_s.clone(), reading.collect()),
-            drive: Drive {
-                segments: std::iter::once(0..t_s.len()).collect(),
-                continues: vec![false],
-                reference: current.into(),
-                t_s: t_s.into(),
-                ..Drive::default()
-            },
-            base: Base::Sensor(SensorBase::default()),
-            modelled: Vec::new(),
-            noise: 0.08,
-            coloured: Coloured::default(),
-            accuracy: Accuracy::default(),
-        }
+        let reading = reading.collect();
+        Problem::pair(t_s, current, reading, 0.08)
     }
 
     #[test]

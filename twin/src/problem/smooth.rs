@@ -222,28 +222,9 @@ fn finer(drive: &Drive, slopes: Slopes) -> Drive {
 #[allow(clippy::unwrap_used, clippy::single_range_in_vec_init)]
 mod tests {
     use super::*;
-    use crate::problem::{Accuracy, Coloured, Observed, SensorBase, View};
 
     fn problem(t_s: Vec<f64>, reference: Vec<f64>) -> Problem {
-        let drive = Drive {
-            segments: std::iter::once(0..t_s.len()).collect(),
-            continues: vec![false],
-            reference: reference.clone().into(),
-            t_s: t_s.clone().into(),
-            ..Drive::default()
-        };
-        Problem {
-            view: View::Sensor,
-            name: "i_meas_a".into(),
-            unit: "A".into(),
-            observed: Observed::with_drive(t_s, reference),
-            drive,
-            base: Base::Sensor(SensorBase::default()),
-            modelled: Vec::new(),
-            noise: 0.1,
-            coloured: Coloured::default(),
-            accuracy: Accuracy::default(),
-        }
+        Problem::pair(t_s, reference.clone(), reference, 0.1)
     }
 
     #[test]
