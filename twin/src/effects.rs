@@ -306,6 +306,11 @@ pub trait Effect: Sync {
     /// Points from which it is searched: values for every parameter, those of [`Search::Linear`] at a small step from off.
     fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>>;
 
+    /// The instants, in s and in order, at which alone it begins to change readings; `None`: it acts all along.
+    fn instants_s(&self, _problem: &Problem) -> Option<Vec<f64>> {
+        None
+    }
+
     /// What values that are each within their limits have to be beside one another, if these are not.
     fn at_odds(&self, _values: &[f64]) -> Option<&'static str> {
         None

@@ -4,7 +4,7 @@
 //! effects could account for what is left, [`fit`] fits them, with [`slope`]s, [`normal`] equations and a [`robust`] loss, and
 //! with what the model file leaves open (`starts`); [`held_out`] says what a fit is worth on rows that it was not made of, and
 //! [`select`] decides. [`intervals`] and [`locate`] say how sure and where; `trust`, [`shape`] and `unfitted` take back names
-//! that the recording or other files do not bear out, `verdict` says what that makes (`quieter`: whether what works between the
+//! that the recording or other files do not bear out, `strays` looks at readings that no noise makes, `verdict` says what that makes (`quieter`: whether what works between the
 //! rows only evens out noise of the reference), `elsewhere` whether another start would do the same, and `told` puts the report
 //! together.
 //! Nothing here knows a file or an effect by name.
@@ -24,6 +24,7 @@ pub mod select;
 pub mod shape;
 pub mod slope;
 mod starts;
+mod strays;
 mod told;
 mod trust;
 mod unfitted;
@@ -43,10 +44,11 @@ use course::Course;
 use fit::Fit;
 use flexible::{Explainable, Features};
 use select::Selection;
+use strays::{name_by_place, slips};
 use told::{attribute, base_found, effects, fitted, plots, sentence, short, times_found};
 use trust::{vague, wavering};
 use unfitted::{Unfitted, confirmed, not_there, veto};
-use verdict::{doubt, judge, slips, unavoidable};
+use verdict::{doubt, judge, unavoidable};
 use workbench::Workbench;
 
 /// Folds for the figures of held-out blocks, each with a fit of its own.
@@ -238,6 +240,7 @@ fn tell(
         held,
         beside,
         elsewhere,
+        placed,
         vetoed,
         ..
     } = decided;
@@ -306,7 +309,7 @@ fn tell(
     let mut sentence = sentence(
         bench,
         &selection,
-        (verdict, doubted, elsewhere.as_deref()),
+        (verdict, doubted, [elsewhere.as_deref(), placed.as_deref()]),
         left,
         (&vetoed, report),
     );
@@ -335,6 +338,8 @@ struct Decided {
     on_white: bool,
     /// See [`elsewhere::elsewhere`].
     elsewhere: Option<String>,
+    /// See [`name_by_place`].
+    placed: Option<String>,
     /// What was taken back for a file that was never fitted.
     vetoed: Vec<&'static str>,
 }
@@ -392,6 +397,7 @@ fn decide(
     }
     shape::withdraw((bench, read), &mut selection, seed);
     let taken_back = passed && selection.named.is_empty();
+    let placed = name_by_place(bench, &mut selection);
     let left = features.explain(&selection.fit.residual, seed);
     let confirmed = confirmed(&selection, others);
     let unavoidable = unavoidable(bench, &selection.fit, seed);
@@ -412,7 +418,7 @@ fn decide(
         verdict,
         (left, &held),
         (confirmed, taken_back),
-        not_there,
+        (not_there, placed.as_deref()),
         unavoidable,
     );
     // A file that was never fitted, with a start of its own, tells a start from physics.
@@ -432,6 +438,7 @@ fn decide(
         held,
         beside,
         elsewhere,
+        placed,
         on_white: bench.is_white(),
         vetoed,
     }

@@ -1,8 +1,8 @@
 //! Memory of the multiplier at a change of range.
 
-use super::scene::{Scale, Scene};
+use super::scene::{Scale, Scene, range_changes};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, sensing, spaced};
-use crate::problem::Problem;
+use crate::problem::{Base, Problem};
 
 /// ±600 A over ±60 A (D0).
 const DEFAULT_RATIO: f64 = 10.0;
@@ -34,6 +34,19 @@ impl Effect for RangeHandover {
                 .range_high
                 .as_ref()
                 .is_some_and(|flag| flag.iter().any(|f| *f > 0.5) && flag.iter().any(|f| *f < 0.5))
+    }
+
+    fn instants_s(&self, problem: &Problem) -> Option<Vec<f64>> {
+        let Base::Sensor(sensor) = &problem.base else {
+            return None;
+        };
+        let drive = &problem.drive;
+        let changes = range_changes(drive, Some(sensor)).into_iter();
+        let mut instants_s: Vec<f64> = changes
+            .map(|change| drive.t_s[change.row] - change.since_s)
+            .collect();
+        instants_s.sort_unstable_by(f64::total_cmp);
+        Some(instants_s)
     }
 
     fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {

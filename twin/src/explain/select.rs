@@ -57,8 +57,11 @@ const VAGUE: usize = 3;
 const SMALL: f64 = 0.2;
 /// Stretches over which two models' losses are compared.
 const STRETCHES: usize = 200;
-/// A model is beaten if another's held-out loss is lower by this many standard errors of their paired difference.
+/// A model is beaten if another's held-out loss is lower by this many standard errors of their paired difference, …
 const BEATEN: f64 = 2.0;
+/// … and by this at least: the logarithm of the odds at so many standard deviations. A difference that is the same in every stretch
+/// has next to no standard error.
+const ODDS: f64 = 0.5 * BEATEN * BEATEN;
 /// The best of many choices counts from where noise would reach once in so many recordings.
 const CHANCE: f64 = 1e-3;
 /// An effect would do as well as another if it takes at least this share of what that one takes.
@@ -108,6 +111,18 @@ impl Selection {
         if let (Some(place), Some(last)) = (place, fit.model.members.last()) {
             self.ids[place] = last.id();
         }
+        self.fit = fit;
+    }
+
+    /// Has another effect besides, the last of `fit`, that no placebo was asked for.
+    pub fn add(&mut self, bench: &Workbench<'_>, fit: Fit) {
+        self.named.push(Named {
+            index: fit.model.members.len() - 1,
+            held_out_gain: share(bench, &self.fit, &fit),
+            placebo_p99: 0.0,
+            equivalent: Vec::new(),
+        });
+        self.ids = fit.model.ids();
         self.fit = fit;
     }
 
@@ -1270,7 +1285,7 @@ pub fn worse(theirs: &[f64], ours: &[f64], stated: f64) -> bool {
     let mean = differences.iter().sum::<f64>() / count;
     let variance =
         differences.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0);
-    mean > BEATEN * (variance / count).sqrt().max(stated / count)
+    mean > (BEATEN * (variance / count).sqrt().max(stated / count)).max(ODDS / count)
 }
 
 /// Whether a model owes what it gains to the alignment of samples that its effect sets free, and not to the effect.

@@ -181,12 +181,13 @@ pub(super) fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> 
     }
 }
 
-/// The verdict in one sentence; `elsewhere` is what another start would do, and `vetoed` is what was taken back for a file that was
+/// The verdict in one sentence; `elsewhere` is what another start would do, `placed` what is to be said against an effect that its place
+/// tells, and `vetoed` is what was taken back for a file that was
 /// never fitted.
 pub(super) fn sentence(
     bench: &Workbench<'_>,
     selection: &Selection,
-    (verdict, doubted, elsewhere): (Verdict, bool, Option<&str>),
+    (verdict, doubted, [elsewhere, placed]): (Verdict, bool, [Option<&str>; 2]),
     left: Explainable,
     (vetoed, report): (&[&str], &Report),
 ) -> String {
@@ -247,6 +248,12 @@ pub(super) fn sentence(
             "{name}: explained by {} ({figures}), but without any physics as well {elsewhere}: initial_soc may be off.",
             ids.join(" and ")
         ),
+        Verdict::Ambiguous if let Some(placed) = placed => {
+            format!(
+                "{name}: explained by {} ({figures}), but {placed}.",
+                ids.join(" and ")
+            )
+        }
         Verdict::Ambiguous if doubted => format!(
             "{name}: explained best by {} ({figures}), but not certainly: another physics of much the same shape may be behind it.",
             ids.join(" and ")

@@ -7,11 +7,11 @@ use super::quieter::only_quietens;
 use super::robust::spread;
 use super::select::{self, Selection, percent};
 use super::slope::change;
+use super::strays::{STRAY, slipped, strays};
 use super::told::short;
 use super::workbench::{Member, Model, Workbench};
 use super::{Held, intervals, jumps, rms};
-use crate::effects::scene::range_changes;
-use crate::problem::{Accuracy, Base, Coloured};
+use crate::problem::{Accuracy, Coloured};
 use crate::report::data::Verdict;
 
 /// Structure left beside the named effects makes the explanation a partial one from this share of the residual on.
@@ -23,22 +23,8 @@ const LOUD: f64 = 1.3;
 /// Where no noise is stated, a mismatch is more than noise with a memory from this multiple of its jumps on.
 const SLOW: f64 = 10.0;
 /// Where no effect passes, loudness is judged by this share of the residual's sizes, which is so many standard deviations of a
-/// normal distribution: a few readings do not make a loud recording. Those have a question of their own, [`STRAY`].
-const COMMON: (f64, f64) = (0.8, 1.2816);
-/// Times the stated noise that noise never is.
-const STRAY: f64 = 8.0;
-/// Up to this share of the readings they are rare.
-const RARE: f64 = 0.01;
-/// What would be so by chance less often than this is not chance.
-const BY_CHANCE: f64 = 0.05;
-/// Fewer readings beyond it are not told from a slip of the log.
-const STRAYS: usize = 2;
-/// Those readings are the mismatch if they make this share of its energy.
-const STRAYED: f64 = 0.5;
-/// So many in a row, all to one side, are the mismatch however little they make of it: something was there for a while.
-const IN_A_ROW: usize = 3;
-/// Where no noise is stated, a heavy tail is a noise of its own: there they have to be nearly all of it.
-const NEARLY_ALL: f64 = 0.9;
+/// normal distribution: a few readings do not make a loud recording. Those have a question of their own ([`super::strays`]).
+pub(super) const COMMON: (f64, f64) = (0.8, 1.2816);
 /// From this correlation on, what is left sits where the named effects act: their shape is wrong.
 const ALIKE: f64 = 0.35;
 /// From this ratio of what is left explainable to what the named effects explain on, their names are not to be trusted: another
@@ -152,26 +138,6 @@ pub(super) fn judge(
     }
 }
 
-/// Single readings that are off by what no noise makes and no named effect can: more than all of them change there. They are rare, and no
-/// few in a row, so that they are slips of the log, or come of what has nothing to do with the names.
-fn slipped(bench: &Workbench<'_>, plain: &Fit, fit: &Fit) -> Vec<usize> {
-    // Behind what cuts or rounds, noise is not what the model file states.
-    let cuts = |member: &Member| member.effect.cuts();
-    if bench.problem.noise <= 0.0 || fit.model.members.iter().any(cuts) {
-        return Vec::new();
-    }
-    let Some(strays) = strays(bench, &fit.residual) else {
-        return Vec::new();
-    };
-    if strays.in_a_row >= IN_A_ROW || strays.rows.len() as f64 > RARE * bench.len() as f64 {
-        return Vec::new();
-    }
-    let by_effects = |row: usize| (fit.predicted[row] - plain.predicted[row]).abs();
-    let mut rows = strays.rows;
-    rows.retain(|&row| fit.residual[row].abs() > by_effects(row));
-    rows
-}
-
 /// Energy of a series but for some of its rows.
 fn without_rows(series: &[f64], rows: &[usize]) -> f64 {
     let taken: f64 = rows.iter().map(|&row| series[row].powi(2)).sum();
@@ -278,127 +244,6 @@ pub(super) fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
     }
 }
 
-/// Readings that no stated noise makes.
-struct Strays {
-    rows: Vec<usize>,
-    /// The largest of them, in the view's unit, and its time in s.
-    largest: f64,
-    at_s: f64,
-    /// So many follow one another, all to one side.
-    in_a_row: usize,
-    /// Whether they are the mismatch: most of it, or so many in a row that it is no slip of the log.
-    decide: bool,
-}
-
-impl Strays {
-    /// How many there are, as the beginning of a sentence.
-    fn counted(&self) -> String {
-        match self.rows.len() {
-            1 => "one reading is".to_owned(),
-            count => format!("{count} readings are"),
-        }
-    }
-}
-
-/// Readings far beyond the stated noise, and what reference and time stamps are accurate to, if there are some.
-fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> {
-    let stated = bench.problem.noise > 0.0;
-    let (noise, least, share) = if stated {
-        (bench.problem.noise, STRAYS, STRAYED)
-    } else {
-        // Of the changes from reading to reading the common ones: the strays are not to hide behind themselves.
-        let jumps: Vec<f64> = jumps(residual);
-        let common = quantile(&jumps, COMMON.0) / COMMON.1 / std::f64::consts::SQRT_2;
-        (common.max(bench.scale.quantum), 1, NEARLY_ALL)
-    };
-    if noise <= 0.0 {
-        return None;
-    }
-    let rows: Vec<usize> = (0..bench.len())
-        .filter(|&row| residual[row].abs() > STRAY * noise + bench.inaccuracy(row))
-        .collect();
-    let largest = *rows
-        .iter()
-        .max_by(|a, b| residual[**a].abs().total_cmp(&residual[**b].abs()))?;
-    let energy: f64 = rows.iter().map(|&row| residual[row].powi(2)).sum();
-    let all: f64 = residual.iter().map(|r| r * r).sum();
-    let in_a_row = rows
-        .chunk_by(|a, b| b - a == 1 && residual[*a] * residual[*b] > 0.0)
-        .map(<[usize]>::len)
-        .fold(0, usize::max);
-    Some(Strays {
-        largest: residual[largest].abs(),
-        at_s: bench.t_s[largest],
-        in_a_row,
-        decide: (rows.len() >= least && energy > share * all) || (stated && in_a_row >= IN_A_ROW),
-        rows,
-    })
-}
-
-/// Whether readings are all next to a change of range, and would hardly be by chance.
-fn at_changes(bench: &Workbench<'_>, rows: &[usize]) -> bool {
-    let Base::Sensor(sensor) = &bench.problem.base else {
-        return false;
-    };
-    let drive = &bench.problem.drive;
-    let changes = range_changes(drive, Some(sensor)).into_iter();
-    let mut changes_s: Vec<f64> = changes
-        .map(|change| drive.t_s[change.row] - change.since_s)
-        .collect();
-    changes_s.sort_unstable_by(f64::total_cmp);
-    let next_to_s = 1.5 * bench.scale.step_s;
-    let is_next = |row: &usize| {
-        let from_s = bench.t_s[*row] - next_to_s;
-        let at = changes_s.partition_point(|change_s| *change_s < from_s);
-        changes_s
-            .get(at)
-            .is_some_and(|change_s| *change_s < from_s + 2.0 * next_to_s)
-    };
-    let share = changes_s.len() as f64 * 2.0 * next_to_s / bench.scale.span_s;
-    rows.iter().all(is_next) && share.powi(rows.len() as i32) < BY_CHANCE
-}
-
-/// What is to be said of readings that no noise makes and that nothing accounts for, where they decide nothing.
-pub(super) fn slips(read: &Workbench<'_>, shown: &Fit, verdict: Verdict) -> Option<String> {
-    // Behind what cuts or rounds, noise is not what the model file states.
-    let cuts = |member: &Member| member.effect.cuts();
-    if read.problem.noise <= 0.0 || shown.model.members.iter().any(cuts) {
-        return None;
-    }
-    let strays = strays(read, &shown.residual)?;
-    let why = if at_changes(read, &strays.rows) {
-        "at changes of range, as range-handover does, but too few here to name it"
-    } else {
-        why_astray(strays.rows.len() as f64 / read.len() as f64, verdict)?
-    };
-    let of_what = if shown.model.members.is_empty() {
-        ""
-    } else {
-        " after all that is named"
-    };
-    Some(format!(
-        "{}: {} off by more than {STRAY} times the stated noise{of_what}, the worst by {} {} at {} s: {why}",
-        read.problem.name,
-        strays.counted(),
-        short(strays.largest),
-        read.problem.unit,
-        short(strays.at_s),
-    ))
-}
-
-/// What such a share of the readings can be. Nothing, where the verdict says that much is left: they are it.
-fn why_astray(share: f64, verdict: Verdict) -> Option<&'static str> {
-    if share <= RARE {
-        Some("a slip of the log, or something too rare here to name")
-    } else if verdict == Verdict::PartlyExplained {
-        None
-    } else {
-        Some(
-            "too many to be slips of the log; their noise is not the stated one, or what makes it is not in the library",
-        )
-    }
-}
-
 /// The least energy that the design lets be left: what is unavoidable, or what the reference's own zero, the readings' steps and
 /// moments that may all be off together make of readings. (What a gain that is off makes, the fit takes.)
 fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
@@ -433,7 +278,7 @@ pub(super) fn doubt(
     verdict: Verdict,
     (left, held): (Explainable, &Held),
     (confirmed, taken_back): (bool, bool),
-    not_there: Option<(f64, String)>,
+    (not_there, placed): (Option<(f64, String)>, Option<&str>),
     unavoidable: f64,
 ) -> (Verdict, Option<f64>) {
     if taken_back && verdict == Verdict::NoMismatch {
@@ -496,6 +341,7 @@ pub(super) fn doubt(
     }
     let elsewhere = not_there.as_ref().map_or(0.0, |(share, _)| *share);
     doubts.extend(not_there.map(|(_, text)| text));
+    doubts.extend(placed.map(str::to_owned));
     doubts.extend(quietening(bench, &selection.fit));
     if doubts.is_empty() {
         return (verdict, None);
@@ -624,23 +470,9 @@ fn correlation(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// The size that a share of a series stays below.
-fn quantile(series: &[f64], share: f64) -> f64 {
+pub(super) fn quantile(series: &[f64], share: f64) -> f64 {
     let mut sizes: Vec<f64> = series.iter().map(|value| value.abs()).collect();
     sizes.sort_unstable_by(f64::total_cmp);
     let at = (sizes.len() as f64 * share) as usize;
     sizes.get(at).copied().unwrap_or_default()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_is_not_rare_is_not_called_rare() {
-        let rare = |share, verdict| why_astray(share, verdict).map(|why| why.contains("too rare"));
-        assert_eq!(rare(2.0 / 3600.0, Verdict::Explained), Some(true));
-        assert_eq!(rare(2.0 / 3600.0, Verdict::PartlyExplained), Some(true));
-        assert_eq!(rare(2448.0 / 3600.0, Verdict::Explained), Some(false));
-        assert_eq!(rare(2448.0 / 3600.0, Verdict::PartlyExplained), None);
-    }
 }
