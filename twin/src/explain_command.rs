@@ -16,10 +16,11 @@ use recording::{
 };
 
 use crate::{
-    explain::{self, Holdout, Options},
+    explain::{self, Holdout, Options, workbench::MOST_ROWS},
     failure::Failure,
     model::{Found, Model, Shift, registry},
     prepare::{Inputs, Item, Prepared, Purpose, prepare},
+    problem::Problem,
     progress::Progress,
     report::{
         data::{self, Report},
@@ -154,11 +155,11 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
         );
         holdouts.push(Holdout {
             file: file.clone(),
-            problems: other.into_problems(),
+            problems: thinned(other),
         });
     }
     drop(reading);
-    let problems = prepared.into_problems();
+    let problems = thinned(prepared);
     let mut explaining = Progress::new(format!("explaining {}", arguments.recording.display()));
     let options = Options {
         without: arguments.without.clone(),
@@ -199,6 +200,12 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     Ok(text::render(&report, width.unwrap_or(WIDTH))
         .trim_end()
         .to_owned())
+}
+
+/// The problems with as many readings as fits look at: the memory of the others is free.
+fn thinned(prepared: Prepared) -> Vec<Problem> {
+    let problems = prepared.into_problems().into_iter();
+    problems.map(|problem| problem.thinned(MOST_ROWS)).collect()
 }
 
 /// A hold-out that lacks the column of the reference, while the recording has its own in a file beside it.

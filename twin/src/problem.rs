@@ -161,6 +161,8 @@ pub struct Observed {
     pub stretches: Stretches,
     /// True if row `k` of the observation is row `k` of the drive (same time stamps): no interpolation then.
     pub on_drive_rows: bool,
+    /// The drive's row that each reading was taken at, where they were but some are left out ([`Problem::thinned`]).
+    pub picked: Option<Vec<usize>>,
     /// Time between two new readings, in s, where readings repeat though the design says that each is new; else 0.
     pub held_s: f64,
     /// Step of the grid on which readings lie and to which the simulation does not round, in the view's unit; 0 if there is none.
@@ -174,6 +176,7 @@ impl Observed {
             valid: vec![true; value.len()],
             stretches: Stretches::one(value.len()),
             on_drive_rows: true,
+            picked: None,
             held_s: 0.0,
             grid: 0.0,
             t_s: t_s.into(),
@@ -302,6 +305,36 @@ impl Problem {
         matches!(&self.base, Base::Sensor(base) if base.quasi_static)
     }
 
+    /// The same with at most so many of its readings, evenly thinned out: the simulation still runs over every row of the drive. Means
+    /// from one reading to the next stay as they are.
+    pub fn thinned(mut self, most: usize) -> Self {
+        let observed = &self.observed;
+        let counts = |row: &usize| observed.valid[*row] && observed.value[*row].is_finite();
+        let counted = || (0..observed.t_s.len()).filter(counts);
+        let stride = counted().count().div_ceil(most.max(1));
+        if stride <= 1 || self.view == View::Charge {
+            return self;
+        }
+        let rows: Vec<usize> = counted().step_by(stride).collect();
+        let of = |series: &[f64]| rows.iter().map(|&row| series[row]).collect::<Vec<f64>>();
+        if let Base::Sensor(base) = &mut self.base
+            && !base.reading.is_empty()
+        {
+            base.reading = of(&base.reading);
+        }
+        self.observed = Observed {
+            t_s: of(&observed.t_s).into(),
+            value: of(&observed.value),
+            valid: vec![true; rows.len()],
+            stretches: rows.iter().map(|&row| observed.segment_of(row)).collect(),
+            on_drive_rows: false,
+            held_s: observed.held_s,
+            grid: observed.grid,
+            picked: observed.on_drive_rows.then_some(rows),
+        };
+        self
+    }
+
     /// A sensor beside its reference in one stretch, both in A and read in the same rows, with white noise of an rms.
     #[cfg(test)]
     pub(crate) fn pair(t_s: Vec<f64>, reference: Vec<f64>, reading: Vec<f64>, noise: f64) -> Self {
@@ -415,6 +448,11 @@ impl Observed {
     /// Index of the drive's segment that a row belongs to.
     pub fn segment_of(&self, row: usize) -> usize {
         self.stretches.segment_of(row)
+    }
+
+    /// Whether readings were taken at rows of the drive: all of them, or some.
+    pub fn shares_rows(&self) -> bool {
+        self.on_drive_rows || self.picked.is_some()
     }
 
     /// Rows that count.

@@ -69,6 +69,7 @@ fn observed(t_s: impl Into<Series>) -> Observed {
         valid: vec![true; rows],
         stretches: Stretches::one(rows),
         on_drive_rows: false,
+        picked: None,
     }
 }
 
@@ -294,6 +295,76 @@ fn explaining_begins_where_simulating_ends() {
         }
         assert!(compared >= 899, "case {index}: {compared}");
     }
+}
+
+/// A thinned recording is simulated as the whole one is: the rows that are left have the same values.
+#[test]
+fn thinned_readings_are_those_of_the_whole_recording() {
+    let rows = profile();
+    let drive = drive(&rows);
+    let shared = Observed {
+        on_drive_rows: true,
+        value: drive.reference.to_vec(),
+        valid: (0..rows.len()).map(|row| row % 10 != 3).collect(),
+        ..observed(drive.t_s.clone())
+    };
+    let own_s: Vec<f64> = (0..900).map(|k| 3.0 + f64::from(k) * 0.123).collect();
+    let own = Observed {
+        value: vec![1.0; own_s.len()],
+        ..observed(own_s)
+    };
+    let effects = [
+        ("gain", vec![1.02]),
+        ("lag", vec![0.3]),
+        ("moving-average", vec![0.5]),
+        ("sampled-window", vec![1.1, 0.6, 0.2]),
+        ("delay", vec![0.07]),
+        ("clock-skew", vec![300.0]),
+        ("hum", vec![1.7, 0.5, 0.3]),
+        ("dead-band", vec![3.0]),
+        ("quantisation", vec![0.5]),
+    ];
+    let sensor = SensorBase::default();
+    for (name, observed) in [("shared rows", shared), ("own rows", own)] {
+        let base = Base::Sensor(sensor.clone());
+        let whole = problem(View::Sensor, base, drive.clone(), observed);
+        let thinned = whole.clone().thinned(200);
+        let left = thinned.observed.t_s.len();
+        assert!((101..=200).contains(&left), "{name}: {left}");
+        let row_of = |t_s: &f64| whole.observed.t_s.iter().position(|there_s| there_s == t_s);
+        let kept: Vec<usize> = thinned
+            .observed
+            .t_s
+            .iter()
+            .map(|t| row_of(t).unwrap())
+            .collect();
+        assert!(kept.iter().all(|&row| whole.observed.valid[row]), "{name}");
+        for of in std::iter::once(&[][..]).chain(effects.chunks(1)) {
+            let of: Vec<(String, Vec<f64>)> = of
+                .iter()
+                .map(|(id, values)| ((*id).to_owned(), values.clone()))
+                .collect();
+            let (all, some) = (
+                explain::predict(&whole, &of),
+                explain::predict(&thinned, &of),
+            );
+            for (&row, some) in kept.iter().zip(some) {
+                let apart = (all[row] - some).abs();
+                assert!(
+                    apart < 1e-9,
+                    "{name}, {of:?}, row {row}: {} and {some}",
+                    all[row]
+                );
+            }
+        }
+    }
+    let charge = problem(
+        View::Charge,
+        Base::Sensor(sensor),
+        drive.clone(),
+        observed(drive.t_s.clone()),
+    );
+    assert_eq!(charge.thinned(200).observed.t_s.len(), rows.len());
 }
 
 fn prepared(folder: &Path, model: &str, recording: &str, purpose: Purpose) -> (Model, Prepared) {

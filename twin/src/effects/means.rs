@@ -5,6 +5,9 @@ use std::ops::Range;
 use super::scene::{Cursor, Steps, area};
 use crate::problem::Drive;
 
+/// Rows of even steps up to which sums from the first row on are kept: they save time, and of more rows take too much memory.
+const SUMMED: usize = 1_000_000;
+
 impl Steps {
     /// Boxcar mean over the `window_s` before each row; before the start of a segment the signal stood at its first value.
     pub fn boxcar(&self, drive: &Drive, input: &[f64], window_s: f64, held: bool) -> Vec<f64> {
@@ -14,7 +17,7 @@ impl Steps {
         }
         for (rows, even_s) in drive.segments.iter().zip(&self.even_s) {
             let (input, output) = (&input[rows.clone()], &mut output[rows.clone()]);
-            match even_s {
+            match even_s.filter(|_| rows.len() <= SUMMED) {
                 Some(step_s) => even_boxcar(input, window_s / step_s, held, output),
                 None => boxcar(&drive.t_s[rows.clone()], input, window_s, held, output),
             }
@@ -31,6 +34,7 @@ impl Steps {
         held: bool,
     ) -> Means<'a> {
         let segment = drive.segments.iter().position(|segment| segment == rows);
+        let segment = segment.filter(|_| rows.len() <= SUMMED);
         Means(match segment.and_then(|segment| self.even_s[segment]) {
             Some(step_s) => MeansOver::Even {
                 means: EvenMeans::new(&input[rows.clone()], held),

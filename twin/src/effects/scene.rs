@@ -626,6 +626,12 @@ impl<'a> Scene<'a> {
         if observed.on_drive_rows && !shifted && view != View::Charge {
             return;
         }
+        if let Some(rows) = &observed.picked
+            && !shifted
+        {
+            self.signal = rows.iter().map(|&row| self.signal[row]).collect();
+            return;
+        }
         let held = self.held();
         let total = (view == View::Charge)
             .then(|| integral(&drive.t_s, &drive.segments, &self.signal, held));

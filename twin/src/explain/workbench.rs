@@ -16,8 +16,9 @@ use crate::effects::scene::{ROUNDS, Scale};
 use crate::effects::{Clues, Effect, LIBRARY, Mark, Parameter, Stage, find_with};
 use crate::problem::{Base, Coloured, Drive, Problem, View};
 
-/// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row).
-const MOST_ROWS: usize = 250_000;
+/// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row), and best before
+/// ([`Problem::thinned`]).
+pub const MOST_ROWS: usize = 250_000;
 /// Blocks that are held out in turn.
 const BLOCKS: usize = 24;
 /// Rows that a block has at least: with fewer than eight blocks, random signs would be all the same too often to be placebos.
@@ -357,7 +358,7 @@ impl<'a> Workbench<'a> {
     /// not told apart by less: a window of a few rows evens that out, whatever the sensor does.
     pub fn stamped(&self) -> f64 {
         let drive = &self.problem.drive;
-        let jitter_s = unevenness(&self.t_s).hypot(if self.problem.observed.on_drive_rows {
+        let jitter_s = unevenness(&self.t_s).hypot(if self.problem.observed.shares_rows() {
             0.0
         } else {
             unevenness(&drive.t_s) * drive.stride() as f64

@@ -111,6 +111,7 @@ pub(super) fn drive_rows(
         value: taken,
         stretches: stretches(drive),
         on_drive_rows: true,
+        picked: None,
         held_s: 0.0,
         grid: 0.0,
     };
@@ -125,6 +126,7 @@ pub(super) fn every_row(drive: &Drive) -> Observed {
         valid: vec![true; drive.len()],
         stretches: stretches(drive),
         on_drive_rows: true,
+        picked: None,
         held_s: 0.0,
         grid: 0.0,
     }

@@ -53,6 +53,7 @@ impl Problem {
         }
         smooth.drive = finer(&self.drive, slopes);
         smooth.observed.on_drive_rows = false;
+        smooth.observed.picked = None;
         smooth
     }
 }
