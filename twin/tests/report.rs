@@ -134,6 +134,19 @@ fn json_gives_numbers_back_as_they_were() {
     );
 }
 
+#[test]
+fn what_its_place_tells_is_not_shown_with_placebos() {
+    let mut report = report_sample::partly_explained();
+    report.effects.truncate(1);
+    let placebos = "Of inputs that cannot be the cause (placebos)";
+    assert!(html::render(&report).contains(placebos));
+    report.effects[0].by_place = Some("one reading is off".into());
+    let page = html::render(&report);
+    assert!(page.contains("Its place tells it: one reading is off."));
+    assert!(!page.contains(placebos));
+    assert!(text::render(&report, 100).contains("by place"));
+}
+
 fn spoil(report: &mut Report, number: f64) {
     report.seconds = number;
     for signal in &mut report.signals {

@@ -83,6 +83,8 @@ pub struct Named {
     pub held_out_gain: f64,
     /// 99th percentile of placebos for the same step.
     pub placebo_p99: f64,
+    /// What tells it if its place does (`strays`).
+    pub by_place: Option<String>,
     /// Effects that would have done as well in its place.
     pub equivalent: Vec<&'static str>,
 }
@@ -114,12 +116,13 @@ impl Selection {
         self.fit = fit;
     }
 
-    /// Has another effect besides, the last of `fit`, that no placebo was asked for.
-    pub fn add(&mut self, bench: &Workbench<'_>, fit: Fit) {
+    /// Has another effect besides, the last of `fit`, that its place tells: no placebo was asked for.
+    pub fn add_by_place(&mut self, bench: &Workbench<'_>, fit: Fit, place: String) {
         self.named.push(Named {
             index: fit.model.members.len() - 1,
             held_out_gain: share(bench, &self.fit, &fit),
             placebo_p99: 0.0,
+            by_place: Some(place),
             equivalent: Vec::new(),
         });
         self.ids = fit.model.ids();
@@ -394,6 +397,7 @@ fn marked(
             index: members.len() - 1,
             held_out_gain,
             placebo_p99,
+            by_place: None,
             equivalent: Vec::new(),
         });
         now = stepped;
@@ -1245,6 +1249,7 @@ fn name(
                 index,
                 held_out_gain: taken,
                 placebo_p99: p99_of(step_p99, id),
+                by_place: None,
                 equivalent,
             }
         })

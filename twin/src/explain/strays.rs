@@ -178,13 +178,15 @@ pub(super) fn name_by_place(bench: &Workbench<'_>, selection: &mut Selection) ->
         1 => "one reading".to_owned(),
         count => format!("{count} readings"),
     };
-    selection.decisions.push(format!(
-        "{} added for its place: {} off by more than {STRAY} times the stated noise, next to where alone it acts (by chance {}), and it takes all of that.",
-        card.id,
+    let place = format!(
+        "{} off by more than {STRAY} times the stated noise, next to where alone it acts (by chance {}), and it takes all of that",
         placed.strays.counted(),
         select::percent(placed.chance)
-    ));
-    selection.add(bench, placed.fit);
+    );
+    selection
+        .decisions
+        .push(format!("{} added for its place: {place}.", card.id));
+    selection.add_by_place(bench, placed.fit, place);
     Some(format!(
         "{} is told by {count} alone, and a slip of the log there would look the same ({} would tell)",
         card.id, card.separated_by

@@ -118,7 +118,10 @@ pub(super) fn effects(
                 .iter()
                 .filter_map(|id| find(id))
                 .map(|effect| effect.card().separated_by)
-                .chain((!named.equivalent.is_empty()).then_some(card.separated_by))
+                .chain(
+                    (!named.equivalent.is_empty() || named.by_place.is_some())
+                        .then_some(card.separated_by),
+                )
                 .collect();
             EffectReport {
                 id: card.id.to_owned(),
@@ -128,6 +131,7 @@ pub(super) fn effects(
                 parameters,
                 held_out_gain: named.held_out_gain,
                 placebo_p99: named.placebo_p99,
+                by_place: named.by_place.clone(),
                 equivalent_to: named.equivalent.iter().map(|id| (*id).to_owned()).collect(),
                 separated_by: separated.join("; or "),
                 consequences: member.effect.consequences(&member.values, bench.problem),

@@ -418,6 +418,7 @@ mod tests {
             index: 1,
             held_out_gain: 0.5,
             placebo_p99: 0.1,
+            by_place: None,
             equivalent: vec!["polarisation"],
         }];
         let without = selection.fit.model.without(1);

@@ -333,6 +333,7 @@ mod tests {
                 parameters: Vec::new(),
                 held_out_gain: 0.5,
                 placebo_p99: 0.0,
+                by_place: None,
                 equivalent_to: Vec::new(),
                 separated_by: String::new(),
                 consequences: Vec::new(),

@@ -179,9 +179,12 @@ pub struct EffectReport {
     pub held_out_gain: f64,
     /// 99th percentile of the same figure for placebos, maximum over the library.
     pub placebo_p99: f64,
+    /// What tells it if its place does: readings at instants at which alone it acts, too few for held-out samples and placebos.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub by_place: Option<String>,
     /// Effects that fit equally well on this recording.
     pub equivalent_to: Vec<String>,
-    /// The recording that would separate them; empty if nothing is equivalent.
+    /// The recording that would separate them, or confirm what its place tells; empty if nothing is equivalent.
     pub separated_by: String,
     /// Results that follow from the parameters (charge per switch), in plain words.
     pub consequences: Vec<String>,

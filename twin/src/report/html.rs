@@ -351,7 +351,12 @@ fn one_effect(page: &mut String, number: usize, effect: &EffectReport) {
         page.push_str("</ul>\n");
     }
     page.push_str("<h4>What it could be confused with</h4>\n");
-    if effect.equivalent_to.is_empty() {
+    if effect.by_place.is_some() {
+        page.push_str(&format!(
+            "<p class=\"confused\">A slip of the log at the same place would look the same. <strong>What would separate them:</strong> {}</p>\n",
+            escape(&effect.separated_by)
+        ));
+    } else if effect.equivalent_to.is_empty() {
         page.push_str(
             "<p>Nothing in the library: no other effect fits this recording as well.</p>\n",
         );
@@ -374,8 +379,16 @@ fn one_effect(page: &mut String, number: usize, effect: &EffectReport) {
 
 /// The gain on samples that were not fitted, against what the best of the placebos reaches.
 fn evidence(page: &mut String, effect: &EffectReport) {
+    page.push_str("<h4>Evidence</h4>\n");
+    if let Some(place) = &effect.by_place {
+        page.push_str(&format!(
+            "<p>Its place tells it: {}. That is too few for samples that were not fitted to confirm it.</p>\n",
+            escape(place)
+        ));
+        return;
+    }
     let ratio = effect.held_out_gain / effect.placebo_p99;
-    page.push_str("<h4>Evidence</h4>\n<div class=\"bars\" aria-hidden=\"true\">");
+    page.push_str("<div class=\"bars\" aria-hidden=\"true\">");
     for (what, class, share) in [
         ("this effect", "gain", effect.held_out_gain),
         ("placebos", "samples", effect.placebo_p99),

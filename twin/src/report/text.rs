@@ -167,11 +167,16 @@ fn effects(report: &Report, width: usize, fullness: Fullness) -> Vec<String> {
             vec![parameters.join(", ")]
         };
         let mut parameters = parameters.into_iter();
+        let [gain, placebos] = if effect.by_place.is_some() {
+            ["by place".to_owned(), String::new()]
+        } else {
+            [effect.held_out_gain, effect.placebo_p99].map(percent)
+        };
         rows.push(vec![
             effect.id.clone(),
             parameters.next().unwrap_or_default(),
-            percent(effect.held_out_gain),
-            percent(effect.placebo_p99),
+            gain,
+            placebos,
         ]);
         rows.extend(parameters.map(|parameter| row(["", &parameter, "", ""])));
         // After so many rows of the table.

@@ -178,6 +178,7 @@ fn effect(
         parameters,
         held_out_gain: gain,
         placebo_p99: 0.0074,
+        by_place: None,
         equivalent_to: Vec::new(),
         separated_by: String::new(),
         consequences: Vec::new(),
