@@ -29,6 +29,7 @@ pub fn make(workspace: &Workspace, python: &Path) -> Result<PathBuf> {
     }
     let stamp = format!("{:016x}", hasher.finish());
     let folder = workspace.target_dir.join("foreign-logs");
+    let _alone = workspace.set_up_alone()?;
     // The script writes `complete` last; the stamp says from what.
     let made_from = folder.join("made-from");
     if folder.join("complete").exists()

@@ -44,6 +44,7 @@ fn environment_of(workspace: &Workspace, lists: &[&str]) -> Result<PathBuf> {
         .target_dir
         .join("python")
         .join(format!("{:016x}", hasher.finish()));
+    let _alone = workspace.set_up_alone()?;
     let python = folder.join("bin/python");
     let complete = folder.join("complete");
     // The link to the system's interpreter may have gone since.

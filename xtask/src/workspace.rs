@@ -2,6 +2,7 @@
 
 use std::{
     env,
+    fs::{self, File, TryLockError},
     path::{Path, PathBuf},
     process::Command,
 };
@@ -51,6 +52,28 @@ impl Workspace {
         command.current_dir(&self.root);
         command
     }
+
+    /// Keeps other runs in this checkout from setting up for as long as the file is open: two would make the same things under each
+    /// other. Waits while another run does.
+    pub fn set_up_alone(&self) -> Result<File> {
+        fs::create_dir_all(&self.target_dir)
+            .with_context(|| format!("making {}", self.target_dir.display()))?;
+        let path = self.target_dir.join("set-up.lock");
+        let file = File::create(&path).with_context(|| format!("opening {}", path.display()))?;
+        match file.try_lock() {
+            Ok(()) => return Ok(file),
+            Err(TryLockError::WouldBlock) => {
+                eprintln!(
+                    "waiting for another run's set-up in {}",
+                    self.target_dir.display()
+                );
+                file.lock()
+            }
+            Err(TryLockError::Error(error)) => Err(error),
+        }
+        .with_context(|| format!("locking {}", path.display()))?;
+        Ok(file)
+    }
 }
 
 /// The cargo that runs this command, else the first on PATH.
@@ -88,4 +111,24 @@ pub fn check_host_components() -> Result<()> {
 
 fn works(subcommand: &str) -> bool {
     process::output(host_cargo().args([subcommand, "--version"])).is_ok()
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_run_sets_up_at_a_time() {
+        let workspace = Workspace {
+            root: PathBuf::new(),
+            target_dir: env::temp_dir().join(format!("hallmark-set-up-{}", std::process::id())),
+        };
+        let first = workspace.set_up_alone().unwrap();
+        let other = File::open(workspace.target_dir.join("set-up.lock")).unwrap();
+        assert!(matches!(other.try_lock(), Err(TryLockError::WouldBlock)));
+        drop(first);
+        assert!(other.try_lock().is_ok());
+        fs::remove_dir_all(&workspace.target_dir).unwrap();
+    }
 }
