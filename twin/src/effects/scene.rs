@@ -143,13 +143,12 @@ pub fn range_changes(drive: &Drive, sensor: Option<&SensorBase>) -> Vec<RangeCha
             (true, false) => down.0.push(size(row)),
         }
     }
-    // A way that is never gone says nothing of its limit: it is that of the other.
-    let (goes_up, goes_down) = (!up.1.is_empty(), !down.0.is_empty());
-    let up = goes_up.then(|| limit(up.0, up.1, sensor.range_limit));
-    let down = goes_down.then(|| limit(down.0, down.1, None));
-    let (Some(up), Some(down)) = (up.or(down), down.or(up)) else {
+    // Of a range that changes one way only, what a change leaves behind is not told from what differs between the ranges.
+    if up.1.is_empty() || down.0.is_empty() {
         return Vec::new();
-    };
+    }
+    let up = limit(up.0, up.1, sensor.range_limit);
+    let down = limit(down.0, down.1, None);
     let mut changes = Vec::new();
     for row in steps() {
         let h = (drive.t_s[row] - drive.t_s[row - stride]).max(0.0);

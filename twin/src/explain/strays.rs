@@ -280,17 +280,17 @@ mod tests {
     const LIMIT_A: f64 = 60.0;
     const NOISE_A: f64 = 0.5;
     const ROWS: u16 = 3000;
-    /// The first row in the large range.
-    const CHANGE: usize = 1509;
+    /// The first row in the large range, and the first one that is not any more.
+    const CHANGE: usize = 1009;
+    const BACK: usize = 2009;
 
-    /// A current that passes into the large range once, half way between two rows, in noise.
+    /// A current that passes into the large range once and comes back, each half way between two rows, in noise.
     fn once_over_the_limit() -> Problem {
         let t_s: Vec<f64> = (0..ROWS).map(|row| STEP_S * f64::from(row)).collect();
-        let over_s = (CHANGE as f64 - 0.5) * STEP_S;
-        let reference: Vec<f64> = t_s
-            .iter()
-            .map(|t| LIMIT_A + 30.0 * (0.2 * (t - over_s)).tanh())
-            .collect();
+        let at_s = |row: usize| (row as f64 - 0.5) * STEP_S;
+        let rise = |t: f64| (0.2 * t).tanh();
+        let pulse = |t: f64| rise(t - at_s(CHANGE)) - rise(t - at_s(BACK)) - 1.0;
+        let reference: Vec<f64> = t_s.iter().map(|t| LIMIT_A + 30.0 * pulse(*t)).collect();
         let noise = |t: f64| 1.4 * NOISE_A * (7919.0 * t * t).sin();
         let reading = t_s.iter().zip(&reference).map(|(t, i)| i + noise(*t));
         let reading = reading.collect();
