@@ -485,13 +485,13 @@ impl<'a> Work<'a> {
             return;
         }
         match &drive.range_high {
-            None if observed.on_drive_rows => {
+            None if observed.on_drive_rows() => {
                 drive.range_high = Some(simulated.to_vec().into());
                 self.remark(
                     "range_high was not recorded: the simulated board's is used".to_owned(),
                 );
             }
-            Some(recorded) if observed.on_drive_rows => {
+            Some(recorded) if observed.on_drive_rows() => {
                 let differ = recorded
                     .iter()
                     .zip(simulated)

@@ -148,6 +148,18 @@ impl FromIterator<usize> for Stretches {
     }
 }
 
+/// When readings were taken.
+#[derive(Clone, Debug, Default)]
+pub enum Moments {
+    /// Reading `k` at row `k` of the drive (same time stamps): no interpolation then.
+    EveryRow,
+    /// Each at a row of the drive, but not at all of them ([`Problem::thinned`]).
+    Rows(Vec<usize>),
+    /// At times of their own.
+    #[default]
+    Own,
+}
+
 /// What was recorded of the signal under test.
 #[derive(Clone, Debug, Default)]
 pub struct Observed {
@@ -159,10 +171,8 @@ pub struct Observed {
     pub valid: Vec<bool>,
     /// The drive's segment that each row belongs to.
     pub stretches: Stretches,
-    /// True if row `k` of the observation is row `k` of the drive (same time stamps): no interpolation then.
-    pub on_drive_rows: bool,
-    /// The drive's row that each reading was taken at, where they were but some are left out ([`Problem::thinned`]).
-    pub picked: Option<Vec<usize>>,
+    /// When they were taken.
+    pub moments: Moments,
     /// Time between two new readings, in s, where readings repeat though the design says that each is new; else 0.
     pub held_s: f64,
     /// Step of the grid on which readings lie and to which the simulation does not round, in the view's unit; 0 if there is none.
@@ -175,8 +185,7 @@ impl Observed {
         Self {
             valid: vec![true; value.len()],
             stretches: Stretches::one(value.len()),
-            on_drive_rows: true,
-            picked: None,
+            moments: Moments::EveryRow,
             held_s: 0.0,
             grid: 0.0,
             t_s: t_s.into(),
@@ -299,6 +308,12 @@ impl Accuracy {
     }
 }
 
+/// At most so many of some rows, evenly.
+pub fn evenly(rows: impl Iterator<Item = usize> + Clone, most: usize) -> Vec<usize> {
+    let stride = rows.clone().count().div_ceil(most.max(1)).max(1);
+    rows.step_by(stride).collect()
+}
+
 impl Problem {
     /// Whether time means nothing in this recording.
     pub fn quasi_static(&self) -> bool {
@@ -309,13 +324,11 @@ impl Problem {
     /// from one reading to the next stay as they are.
     pub fn thinned(mut self, most: usize) -> Self {
         let observed = &self.observed;
-        let counts = |row: &usize| observed.valid[*row] && observed.value[*row].is_finite();
-        let counted = || (0..observed.t_s.len()).filter(counts);
-        let stride = counted().count().div_ceil(most.max(1));
-        if stride <= 1 || self.view == View::Charge {
+        if self.view == View::Charge || observed.valid_rows() <= most {
             return self;
         }
-        let rows: Vec<usize> = counted().step_by(stride).collect();
+        let counts = |row: &usize| observed.valid[*row] && observed.value[*row].is_finite();
+        let rows = evenly((0..observed.t_s.len()).filter(counts), most);
         let of = |series: &[f64]| rows.iter().map(|&row| series[row]).collect::<Vec<f64>>();
         if let Base::Sensor(base) = &mut self.base
             && !base.reading.is_empty()
@@ -327,10 +340,13 @@ impl Problem {
             value: of(&observed.value),
             valid: vec![true; rows.len()],
             stretches: rows.iter().map(|&row| observed.segment_of(row)).collect(),
-            on_drive_rows: false,
             held_s: observed.held_s,
             grid: observed.grid,
-            picked: observed.on_drive_rows.then_some(rows),
+            moments: match &observed.moments {
+                Moments::EveryRow => Moments::Rows(rows),
+                Moments::Rows(at) => Moments::Rows(rows.iter().map(|&row| at[row]).collect()),
+                Moments::Own => Moments::Own,
+            },
         };
         self
     }
@@ -450,9 +466,18 @@ impl Observed {
         self.stretches.segment_of(row)
     }
 
-    /// Whether readings were taken at rows of the drive: all of them, or some.
-    pub fn shares_rows(&self) -> bool {
-        self.on_drive_rows || self.picked.is_some()
+    /// Whether row `k` of the observation is row `k` of the drive.
+    pub fn on_drive_rows(&self) -> bool {
+        matches!(self.moments, Moments::EveryRow)
+    }
+
+    /// The drive's row at which a reading was taken, unless it has a time of its own.
+    pub fn drive_row(&self, row: usize) -> Option<usize> {
+        match &self.moments {
+            Moments::EveryRow => Some(row),
+            Moments::Rows(rows) => rows.get(row).copied(),
+            Moments::Own => None,
+        }
     }
 
     /// Rows that count.

@@ -34,7 +34,7 @@ fn sensor(base: &SensorBase, drive: &Drive, observed: &Observed, view: View) -> 
                     });
                 }
                 _ if base.window_s > 0.0 => area.mean(segment, now_s - base.window_s, now_s),
-                _ if observed.on_drive_rows => drive.reference[row],
+                _ if observed.on_drive_rows() => drive.reference[row],
                 _ => area.value(segment, now_s),
             };
             if base.step > 0.0 {
@@ -63,7 +63,7 @@ fn battery(base: &BatteryBase, drive: &Drive, observed: &Observed, view: View) -
             };
         }
     }
-    if observed.on_drive_rows {
+    if observed.on_drive_rows() {
         return simulated;
     }
     let area = Area::new(drive, &simulated, false);

@@ -75,7 +75,7 @@ fn a_plain_pair_is_taken_as_it_is() {
         (problem.name.as_str(), problem.unit.as_str()),
         ("i_meas_a", "A")
     );
-    assert!(problem.observed.on_drive_rows);
+    assert!(problem.observed.on_drive_rows());
     assert_eq!(problem.observed.valid_rows(), 200);
     assert_eq!(problem.drive.segments, vec![0..200]);
     assert_eq!(problem.drive.reference[7], current(0.7));
@@ -275,7 +275,7 @@ fn rows_of_their_own_are_not_interpolated() {
         }
     });
     let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
-    assert!(!problem.observed.on_drive_rows);
+    assert!(!problem.observed.on_drive_rows());
     assert_eq!(problem.drive.len(), 200);
     assert_eq!(problem.observed.t_s.len(), 200);
     assert!((problem.observed.t_s[3] - 0.35).abs() < 1e-12);
@@ -612,7 +612,7 @@ fn a_reference_of_its_own_becomes_the_drive() {
     let prepared = prepare(&model, &inputs, Purpose::Compare).unwrap();
     let problem = &prepared.items[0].problem;
     assert_eq!(problem.drive.len(), 6000);
-    assert!(!problem.observed.on_drive_rows);
+    assert!(!problem.observed.on_drive_rows());
     assert!(
         (problem.observed.t_s[0] - 10.0).abs() < 0.03,
         "{}",
@@ -644,7 +644,7 @@ fn a_reference_that_is_missing_masks_its_reading() {
     let (problem, _) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
     let left_out = (0..600).filter(|k| gap(*k)).count();
     assert_eq!(problem.observed.valid_rows(), 600 - left_out);
-    assert!(problem.observed.on_drive_rows);
+    assert!(problem.observed.on_drive_rows());
 }
 
 #[test]

@@ -19,7 +19,8 @@ use twin::{
     model::{FrontEndKind, Model},
     prepare::{Inputs, Prepared, Purpose, prepare},
     problem::{
-        Base, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, Series, Stretches, View,
+        Base, BatteryBase, Coloured, Drive, Moments, Observed, Problem, SensorBase, Series,
+        Stretches, View,
     },
     simulate::{
         board::{Board, Pace},
@@ -68,8 +69,7 @@ fn observed(t_s: impl Into<Series>) -> Observed {
         value: vec![f64::NAN; rows],
         valid: vec![true; rows],
         stretches: Stretches::one(rows),
-        on_drive_rows: false,
-        picked: None,
+        moments: Moments::Own,
     }
 }
 
@@ -244,7 +244,7 @@ fn explaining_begins_where_simulating_ends() {
     let drive = drive(&rows);
     let own: Vec<f64> = (0..900).map(|k| 3.0 + f64::from(k) * 0.123).collect();
     let shared = Observed {
-        on_drive_rows: true,
+        moments: Moments::EveryRow,
         ..observed(drive.t_s.clone())
     };
     let battery = BatteryBase {
@@ -303,7 +303,7 @@ fn thinned_readings_are_those_of_the_whole_recording() {
     let rows = profile();
     let drive = drive(&rows);
     let shared = Observed {
-        on_drive_rows: true,
+        moments: Moments::EveryRow,
         value: drive.reference.to_vec(),
         valid: (0..rows.len()).map(|row| row % 10 != 3).collect(),
         ..observed(drive.t_s.clone())

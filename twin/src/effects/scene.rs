@@ -4,7 +4,9 @@ use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
 
-use crate::problem::{Base, BatteryBase, Drive, Observed, Problem, SensorBase, Series, View};
+use crate::problem::{
+    Base, BatteryBase, Drive, Moments, Observed, Problem, SensorBase, Series, View,
+};
 
 /// Reference temperature of every temperature coefficient, in °C.
 pub const REFERENCE_C: f64 = 25.0;
@@ -622,14 +624,15 @@ impl<'a> Scene<'a> {
         let drive = self.drive;
         let observed = self.observed;
         let shifted = self.delay_s != 0.0 || self.skew != 0.0;
-        if observed.on_drive_rows && !shifted && view != View::Charge {
-            return;
-        }
-        if let Some(rows) = &observed.picked
-            && !shifted
-        {
-            self.signal = rows.iter().map(|&row| self.signal[row]).collect();
-            return;
+        if !shifted && view != View::Charge {
+            match &observed.moments {
+                Moments::EveryRow => return,
+                Moments::Rows(rows) => {
+                    self.signal = rows.iter().map(|&row| self.signal[row]).collect();
+                    return;
+                }
+                Moments::Own => (),
+            }
         }
         let held = self.held();
         let total = (view == View::Charge)

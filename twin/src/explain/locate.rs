@@ -113,14 +113,14 @@ pub fn variables(bench: &Workbench<'_>) -> Vec<Variable> {
 fn at_rows(bench: &Workbench<'_>, series: &[f64]) -> Vec<f64> {
     let drive = &bench.problem.drive;
     let observed = &bench.problem.observed;
-    if observed.on_drive_rows {
-        return bench.rows.iter().map(|&row| series[row]).collect();
-    }
     let mut current: Option<(usize, Cursor<'_>)> = None;
     bench
         .rows
         .iter()
         .map(|&row| {
+            if let Some(row) = observed.drive_row(row) {
+                return series[row];
+            }
             let segment = observed.segment_of(row);
             let Some(range) = drive
                 .segments

@@ -107,7 +107,7 @@ fn quiet(bench: &Workbench<'_>) -> Problem {
             value: Vec::new(),
             valid: observed.valid.clone(),
             stretches: observed.stretches.clone(),
-            picked: observed.picked.clone(),
+            moments: observed.moments.clone(),
             ..*observed
         },
         name: problem.name.clone(),

@@ -5,6 +5,9 @@ use super::normal::sum_of;
 /// Residuals beyond this many standard deviations count by their size, not by its square (Huber).
 pub const TUNING: f64 = 3.0;
 
+/// A share of sizes, and the standard deviations of a normal distribution that it stays below.
+const COMMON: (f64, f64) = (0.8, 1.2816);
+
 /// Spread by the median of absolute values, kept from vanishing where most residuals are nothing.
 pub fn spread(residual: &[f64]) -> f64 {
     let mut sizes: Vec<f64> = residual.iter().map(|r| r.abs()).collect();
@@ -15,6 +18,15 @@ pub fn spread(residual: &[f64]) -> f64 {
     let middle = sizes.len() / 2;
     let median = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1;
     (1.4826 * median).max(0.3 * rms).max(1e-12)
+}
+
+/// Spread by the size that four of five stay below: what the others do has no part in it.
+pub fn common(residual: &[f64]) -> f64 {
+    let mut sizes: Vec<f64> = residual.iter().map(|r| r.abs()).collect();
+    sizes.sort_unstable_by(f64::total_cmp);
+    let (share, deviations) = COMMON;
+    let at = (sizes.len() as f64 * share) as usize;
+    sizes.get(at).copied().unwrap_or_default() / deviations
 }
 
 /// Huber's loss of a residual in units of sigma.

@@ -2,10 +2,9 @@
 
 use super::fit::{self, Fit};
 use super::jumps;
-use super::robust::loss;
+use super::robust::{common, loss};
 use super::select::{self, Selection, joins};
 use super::told::short;
-use super::verdict::{COMMON, quantile};
 use super::workbench::{Member, Workbench};
 use crate::effects::Effect;
 use crate::report::data::Verdict;
@@ -42,11 +41,11 @@ pub(super) struct Strays {
 }
 
 impl Strays {
-    /// How many there are, as the beginning of a sentence.
-    pub(super) fn counted(&self) -> String {
+    /// How many there are, in words, and the verb that goes with it.
+    pub(super) fn counted(&self) -> (String, &'static str) {
         match self.rows.len() {
-            1 => "one reading is".to_owned(),
-            count => format!("{count} readings are"),
+            1 => ("one reading".to_owned(), "is"),
+            count => (format!("{count} readings"), "are"),
         }
     }
 
@@ -84,9 +83,8 @@ pub(super) fn strays(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strays> 
         (bench.problem.noise, STRAYS, STRAYED)
     } else {
         // Of the changes from reading to reading the common ones: the strays are not to hide behind themselves.
-        let jumps: Vec<f64> = jumps(residual);
-        let common = quantile(&jumps, COMMON.0) / COMMON.1 / std::f64::consts::SQRT_2;
-        (common.max(bench.scale.quantum), 1, NEARLY_ALL)
+        let noise = common(&jumps(residual)) / std::f64::consts::SQRT_2;
+        (noise.max(bench.scale.quantum), 1, NEARLY_ALL)
     };
     if noise <= 0.0 {
         return None;
@@ -157,9 +155,10 @@ fn placed(bench: &Workbench<'_>, fit: &Fit) -> Option<Placed> {
     }
     let (effect, chance, fit) = bench.library.iter().copied().find_map(|effect| {
         let chance = strays.chance_at(bench, effect);
-        let asked = chance < NAMED && joins(&fit.model, effect);
-        let taken = asked.then(|| taken(bench, fit, effect, &strays.rows))??;
-        Some((effect, chance, taken))
+        if chance >= NAMED || !joins(&fit.model, effect) {
+            return None;
+        }
+        Some((effect, chance, taken(bench, fit, effect, &strays.rows)?))
     })?;
     Some(Placed {
         effect,
@@ -174,13 +173,9 @@ fn placed(bench: &Workbench<'_>, fit: &Fit) -> Option<Placed> {
 pub(super) fn name_by_place(bench: &Workbench<'_>, selection: &mut Selection) -> Option<String> {
     let placed = placed(bench, &selection.fit)?;
     let card = placed.effect.card();
-    let count = match placed.strays.rows.len() {
-        1 => "one reading".to_owned(),
-        count => format!("{count} readings"),
-    };
+    let (count, are) = placed.strays.counted();
     let place = format!(
-        "{} off by more than {STRAY} times the stated noise, next to where alone it acts (by chance {}), and it takes all of that",
-        placed.strays.counted(),
+        "{count} {are} off by more than {STRAY} times the stated noise, next to where alone it acts (by chance {}), and it takes all of that",
         select::percent(placed.chance)
     );
     selection
@@ -240,15 +235,15 @@ pub(super) fn slips(read: &Workbench<'_>, shown: &Fit, verdict: Verdict) -> Opti
         ),
         None => why_astray(strays.rows.len() as f64 / read.len() as f64, verdict)?.to_owned(),
     };
+    let (count, are) = strays.counted();
     let of_what = if shown.model.members.is_empty() {
         ""
     } else {
         " after all that is named"
     };
     Some(format!(
-        "{}: {} off by more than {STRAY} times the stated noise{of_what}, the worst by {} {} at {} s: {why}",
+        "{}: {count} {are} off by more than {STRAY} times the stated noise{of_what}, the worst by {} {} at {} s: {why}",
         read.problem.name,
-        strays.counted(),
         short(strays.largest),
         read.problem.unit,
         short(strays.at_s),

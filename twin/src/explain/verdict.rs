@@ -4,7 +4,7 @@ use super::fit::{self, Fit};
 use super::flexible::{Explainable, Features};
 use super::normal::dot;
 use super::quieter::only_quietens;
-use super::robust::spread;
+use super::robust::{common, spread};
 use super::select::{self, Selection, percent};
 use super::slope::change;
 use super::strays::{STRAY, slipped, strays};
@@ -22,9 +22,6 @@ const STRUCTURE: f64 = 0.1;
 const LOUD: f64 = 1.3;
 /// Where no noise is stated, a mismatch is more than noise with a memory from this multiple of its jumps on.
 const SLOW: f64 = 10.0;
-/// Where no effect passes, loudness is judged by this share of the residual's sizes, which is so many standard deviations of a
-/// normal distribution: a few readings do not make a loud recording. Those have a question of their own ([`super::strays`]).
-pub(super) const COMMON: (f64, f64) = (0.8, 1.2816);
 /// From this correlation on, what is left sits where the named effects act: their shape is wrong.
 const ALIKE: f64 = 0.35;
 /// From this ratio of what is left explainable to what the named effects explain on, their names are not to be trusted: another
@@ -156,10 +153,8 @@ fn without_names(bench: &Workbench<'_>, selection: &mut Selection, before: Expla
     };
     let residual = &selection.plain.residual;
     let as_read = bench.as_read(residual);
-    let common = |residual: &[f64]| {
-        let common = quantile(residual, COMMON.0) / COMMON.1;
-        common.min(rms(residual.iter().copied()))
-    };
+    // A few readings do not make a loud recording. Those have a question of their own (`strays`).
+    let common = |residual: &[f64]| common(residual).min(rms(residual.iter().copied()));
     // What the readings jump by from one to the next is the most that noise without a memory can be.
     let (floor, times, of) = if noise > 0.0 {
         (known, LOUD, "the noise that the model file states")
@@ -199,9 +194,9 @@ fn without_names(bench: &Workbench<'_>, selection: &mut Selection, before: Expla
         ));
         Verdict::Unknown
     } else if let Some(strays) = strays(bench, residual).filter(|strays| strays.decide) {
+        let (count, are) = strays.counted();
         selection.decisions.push(format!(
-            "No effect passes, yet {} off by more than {STRAY} times {of}, and not the others, the worst by {} {} at {} s: unknown.",
-            strays.counted(),
+            "No effect passes, yet {count} {are} off by more than {STRAY} times {of}, and not the others, the worst by {} {} at {} s: unknown.",
             short(strays.largest),
             bench.problem.unit,
             short(strays.at_s),
@@ -467,12 +462,4 @@ fn correlation(a: &[f64], b: &[f64]) -> f64 {
         bb += y * y;
     }
     ab / (aa * bb).sqrt().max(1e-300)
-}
-
-/// The size that a share of a series stays below.
-pub(super) fn quantile(series: &[f64], share: f64) -> f64 {
-    let mut sizes: Vec<f64> = series.iter().map(|value| value.abs()).collect();
-    sizes.sort_unstable_by(f64::total_cmp);
-    let at = (sizes.len() as f64 * share) as usize;
-    sizes.get(at).copied().unwrap_or_default()
 }

@@ -14,10 +14,10 @@ use super::whiten::Whitening;
 use crate::effects::chain::{Begun, Chain, Change, Nuisance, Variation};
 use crate::effects::scene::{ROUNDS, Scale};
 use crate::effects::{Clues, Effect, LIBRARY, Mark, Parameter, Stage, find_with};
-use crate::problem::{Base, Coloured, Drive, Problem, View};
+use crate::problem::{Base, Coloured, Drive, Moments, Problem, View, evenly};
 
-/// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row), and best before
-/// ([`Problem::thinned`]).
+/// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row). [`Problem::thinned`]
+/// does so ahead, for less memory; here it is done for what it leaves as it is.
 pub const MOST_ROWS: usize = 250_000;
 /// Blocks that are held out in turn.
 const BLOCKS: usize = 24;
@@ -173,13 +173,10 @@ impl<'a> Workbench<'a> {
         let chain = Chain::new(problem);
         let all = chain.run(&[], &Nuisance::default());
         let observed = &problem.observed;
-        let valid = || {
-            (0..observed.t_s.len()).filter(|&row| {
-                observed.valid[row] && observed.value[row].is_finite() && all[row].is_finite()
-            })
-        };
-        let stride = valid().count().div_ceil(MOST_ROWS).max(1);
-        let rows: Vec<usize> = valid().step_by(stride).collect();
+        let valid = (0..observed.t_s.len()).filter(|&row| {
+            observed.valid[row] && observed.value[row].is_finite() && all[row].is_finite()
+        });
+        let rows = evenly(valid, MOST_ROWS);
         let at = |series: &[f64]| rows.iter().map(|&row| series[row]).collect::<Vec<f64>>();
         let (t_s, y, plain) = (at(&observed.t_s), at(&observed.value), at(&all));
         let modelled = (0..problem.modelled.len())
@@ -358,10 +355,9 @@ impl<'a> Workbench<'a> {
     /// not told apart by less: a window of a few rows evens that out, whatever the sensor does.
     pub fn stamped(&self) -> f64 {
         let drive = &self.problem.drive;
-        let jitter_s = unevenness(&self.t_s).hypot(if self.problem.observed.shares_rows() {
-            0.0
-        } else {
-            unevenness(&drive.t_s) * drive.stride() as f64
+        let jitter_s = unevenness(&self.t_s).hypot(match self.problem.observed.moments {
+            Moments::EveryRow | Moments::Rows(_) => 0.0,
+            Moments::Own => unevenness(&drive.t_s) * drive.stride() as f64,
         });
         (0..self.len())
             .map(|row| (jitter_s * self.slope_per_s(row)).powi(2))
@@ -577,7 +573,7 @@ fn nearest(problem: &Problem, rows: &[usize]) -> Vec<f64> {
     let observed = &problem.observed;
     rows.iter()
         .map(|&row| {
-            if observed.on_drive_rows {
+            if let Some(row) = observed.drive_row(row) {
                 return drive.reference[row];
             }
             let Some(range) = drive.segments.get(observed.segment_of(row)) else {

@@ -209,7 +209,7 @@ fn beside<'a>(
 
 /// The reference at a reading.
 fn reference_at(drive: &Drive, observed: &Observed, row: usize) -> f64 {
-    if observed.on_drive_rows {
+    if observed.on_drive_rows() {
         drive.reference[row]
     } else {
         at(drive, observed.segment_of(row), observed.t_s[row])
@@ -588,7 +588,7 @@ fn clipped(pairs: impl Iterator<Item = (f64, f64)> + Clone, measured: &str) -> V
 
 /// Single rows of the reference that jump there and back, which the sensor does not show.
 fn spikes(drive: &Drive, observed: &Observed, reference: &str) -> Option<String> {
-    if !observed.on_drive_rows {
+    if !observed.on_drive_rows() {
         return None;
     }
     let mut steps: Vec<f64> = drive
@@ -630,7 +630,7 @@ fn spikes(drive: &Drive, observed: &Observed, reference: &str) -> Option<String>
 
 /// A stretch in which the reference stands still to the last digit while the sensor moves.
 fn stuck(drive: &Drive, observed: &Observed, reference: &str, measured: &str) -> Option<String> {
-    if !observed.on_drive_rows {
+    if !observed.on_drive_rows() {
         return None;
     }
     let wide = spread(observed.value.iter().copied());

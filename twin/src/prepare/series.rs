@@ -3,7 +3,7 @@
 use std::{ops::Range, sync::Arc};
 
 use super::Frame;
-use crate::problem::{Drive, Observed, Stretches};
+use crate::problem::{Drive, Moments, Observed, Stretches};
 
 /// A step is a gap if it is longer than this many median steps, …
 const GAP_STEPS: f64 = 10.0;
@@ -110,8 +110,7 @@ pub(super) fn drive_rows(
             .collect(),
         value: taken,
         stretches: stretches(drive),
-        on_drive_rows: true,
-        picked: None,
+        moments: Moments::EveryRow,
         held_s: 0.0,
         grid: 0.0,
     };
@@ -125,8 +124,7 @@ pub(super) fn every_row(drive: &Drive) -> Observed {
         value: vec![f64::NAN; drive.len()],
         valid: vec![true; drive.len()],
         stretches: stretches(drive),
-        on_drive_rows: true,
-        picked: None,
+        moments: Moments::EveryRow,
         held_s: 0.0,
         grid: 0.0,
     }

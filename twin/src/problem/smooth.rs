@@ -8,7 +8,7 @@
 
 use std::ops::Range;
 
-use super::{Base, Drive, Problem, Series};
+use super::{Base, Drive, Moments, Problem, Series};
 
 /// Rows that take one step's place at most.
 const PARTS: usize = 4;
@@ -52,8 +52,7 @@ impl Problem {
             base.smooth_reference = true;
         }
         smooth.drive = finer(&self.drive, slopes);
-        smooth.observed.on_drive_rows = false;
-        smooth.observed.picked = None;
+        smooth.observed.moments = Moments::Own;
         smooth
     }
 }
