@@ -1,0 +1,138 @@
+//! What the readings themselves show without any simulation: a grid of values, a rail.
+
+use super::losses::share;
+use super::obstacle::{FLOOR, obstacle};
+use super::{Named, percent};
+use crate::explain::fit::{Fit, fit};
+use crate::explain::normal::dot;
+use crate::explain::workbench::{Member, Workbench};
+
+/// A simulation that is rounded may be off by this many times the variance of rounding more than one that is not: by once where
+/// noise is as loud as a step, and chance.
+const DITHERED: f64 = 1.1;
+/// An error that is larger by less than this factor is not.
+const NO_LARGER: f64 = 1.01;
+
+/// Adds what the readings themselves show, without any simulation (a grid of values), and takes away what only imitated it.
+pub(super) fn marked(
+    bench: &Workbench<'_>,
+    now: Fit,
+    mut named: Vec<Named>,
+    decisions: &mut Vec<String>,
+) -> (Fit, Vec<Named>) {
+    let mut now = now;
+    for effect in bench.library.iter().copied() {
+        let card = effect.card();
+        let mut members = now.model.members.iter();
+        if members.any(|member| member.id() == card.id && bench.shown(member).is_some()) {
+            continue;
+        }
+        let Some(mark) = bench.mark(effect) else {
+            continue;
+        };
+        let mut base = now.model.clone();
+        base.members
+            .retain(|member| member.id() != card.id && !card.looks_like.contains(&member.id()));
+        let left = |fit: &Fit| {
+            let residual = bench.as_read(&fit.residual);
+            dot(&residual, &residual) / residual.len().max(1) as f64
+        };
+        let energy = left(&now).max(1e-300);
+        if mark.variance < FLOOR * energy {
+            continue;
+        }
+        let smooth = missed(bench, fit(bench, &base, None));
+        let model = smooth.model.with(Member {
+            effect,
+            values: mark.values.clone(),
+        });
+        // The other values are those of the smooth simulation: steps have no slope to fit by.
+        let stepped = Fit::of(bench, model, smooth.cost);
+        let members = &stepped.model.members;
+        // Where noise goes to and fro over the edges, rounding the simulation adds at most a second rounding error.
+        let there = left(&stepped);
+        let rounding = if effect.rounds() { mark.variance } else { 0.0 };
+        if there > NO_LARGER * energy + DITHERED * rounding {
+            decisions.push(format!(
+                "{} not added, though the readings {}: it makes the error larger than noise ahead of it would.",
+                card.id, mark.what
+            ));
+            continue;
+        }
+        // What a rail seems to cut off may be what another effect, or the fit, has taken away already.
+        let gain = if effect.rounds() {
+            (mark.variance / energy).min(1.0)
+        } else {
+            1.0 - there / left(&smooth).max(1e-300)
+        };
+        if gain < FLOOR {
+            continue;
+        }
+        decisions.push(format!(
+            "{} added: the readings {}; that makes {} of the residual's energy.",
+            card.id,
+            mark.what,
+            percent(gain)
+        ));
+        let found = named
+            .iter()
+            .find(|one| now.model.members[one.index].id() == card.id);
+        // Found without its mark, it has what speaks for it.
+        let (held_out_gain, placebo_p99) =
+            found.map_or((gain, 0.0), |one| (one.held_out_gain, one.placebo_p99));
+        let kept: Vec<Named> = named
+            .iter()
+            .filter_map(|one| {
+                let id = now.model.members[one.index].id();
+                let index = members.iter().position(|member| member.id() == id)?;
+                (id != card.id).then(|| Named {
+                    index,
+                    ..one.clone()
+                })
+            })
+            .collect();
+        named = kept;
+        named.push(Named {
+            index: members.len() - 1,
+            held_out_gain,
+            placebo_p99,
+            by_place: None,
+            equivalent: Vec::new(),
+        });
+        now = stepped;
+    }
+    (now, named)
+}
+
+/// Leaves out what is too small beside the others: steps make single readings jump by what hardly moves them.
+fn missed(bench: &Workbench<'_>, mut now: Fit) -> Fit {
+    let mut index = 0;
+    while index < now.model.members.len() {
+        let without = fit(bench, &now.model.without(index), None);
+        let gain = share(bench, &without, &now);
+        if obstacle(bench, &without, &now, index, gain).is_some() {
+            now = without;
+        } else {
+            index += 1;
+        }
+    }
+    now
+}
+
+/// Switches off what does nothing (a rail that no reading reaches).
+pub(super) fn idle_off(bench: &Workbench<'_>, now: &mut Fit) {
+    for m in 0..now.model.members.len() {
+        let parameters = now.model.members[m].effect.card().parameters;
+        for (p, parameter) in parameters.iter().enumerate() {
+            if !parameter.off.is_infinite() {
+                continue;
+            }
+            let mut model = now.model.clone();
+            model.members[m].values[p] = parameter.off;
+            // The same to the last digit: all that was found for the model stands.
+            if bench.run(&model) == now.predicted {
+                now.model = model;
+            }
+        }
+    }
+}
