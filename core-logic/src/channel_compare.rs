@@ -21,13 +21,14 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::design_parameters::LARGE_FULL_SCALE;
 use crate::error_budget;
 use crate::front_end::PerRange;
 use crate::meter::MeterReport;
 use crate::range::Range;
 use crate::units::{
-    Duration, Instant, Microamps, Nanocoulombs, Ppm, add_i128, clamp_i64, div_i128, elapsed,
-    milliseconds, mul_i128, mul_wide, sub_i128,
+    self, Duration, Instant, Microamps, Nanocoulombs, Ppm, add_i64, clamp_i32, elapsed,
+    milliseconds, mul_div, mul_i64,
 };
 
 /// Tolerances and windows.
@@ -129,16 +130,19 @@ pub struct CompareReport {
     pub meter_lost: bool,
     /// Fast windows that disagreed; stops at the type's end.
     pub disagreements: u32,
+    /// Bound of the charge that the meter has missed or miscounted since the start while it stood still or disagreed. What a
+    /// meter that stands still misses is in it once that is found, from its last count on.
+    pub miscounted: Nanocoulombs,
 }
 
-/// What the converter has measured since the start.
+/// What the converter has measured since the start. Its sums may wrap: only differences are used, over seconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 struct Integral {
-    /// pC.
-    charge: i128,
-    /// pC by which it may differ from a meter without fault.
-    doubt: i128,
+    /// nC.
+    charge: i64,
+    /// nC by which it may differ from a meter without fault.
+    doubt: i64,
     /// µs covered.
     covered: u64,
 }
@@ -147,8 +151,8 @@ impl Integral {
     #[inline(never)]
     const fn since(&self, earlier: &Self) -> Self {
         Self {
-            charge: sub_i128(self.charge, earlier.charge),
-            doubt: sub_i128(self.doubt, earlier.doubt),
+            charge: self.charge.wrapping_sub(earlier.charge),
+            doubt: self.doubt.wrapping_sub(earlier.doubt),
             covered: self.covered.saturating_sub(earlier.covered),
         }
     }
@@ -189,6 +193,9 @@ struct Window {
 struct Count {
     at: Instant,
     charge: Nanocoulombs,
+    /// [`ChannelCompare::flowed`] at the report before, up to which it has counted: what came later may be missing. Moves on with
+    /// what is declared.
+    before: Nanocoulombs,
     /// The converter's integral at the begin of the first conversion that began after that: what a conversion under way
     /// at the last count has measured may have been counted.
     converter: Option<Integral>,
@@ -207,6 +214,13 @@ pub struct ChannelCompare {
     pending: Option<MeterPoint>,
     /// The meter's last count.
     moved: Option<Count>,
+    /// Bound of the charge, without sign, that has flowed up to the end of the newest usable conversion.
+    flowed: (Nanocoulombs, Instant),
+    /// [`ChannelCompare::flowed`] at the newest report, and that report's instant.
+    reported: (Nanocoulombs, Instant),
+    /// A stand-still that has ended by the report of this instant, up to which conversions have not come yet; and
+    /// [`Count::before`].
+    ended: Option<(Nanocoulombs, Instant)>,
     gaps: u32,
     /// Reports of an earlier time are not looked at.
     not_before: Instant,
@@ -234,6 +248,9 @@ impl ChannelCompare {
             slow: None,
             pending: None,
             moved: None,
+            flowed: (Nanocoulombs::ZERO, Instant::from_ticks(0)),
+            reported: (Nanocoulombs::ZERO, Instant::from_ticks(0)),
+            ended: None,
             gaps: 0,
             not_before: Instant::from_ticks(0),
             report: CompareReport {
@@ -242,6 +259,7 @@ impl ChannelCompare {
                 frozen: false,
                 meter_lost: false,
                 disagreements: 0,
+                miscounted: Nanocoulombs::ZERO,
             },
         }
     }
@@ -265,6 +283,8 @@ impl ChannelCompare {
             return self.report;
         }
         let Some((previous, spoiled)) = self.last else {
+            // Of what flowed since the newest conversion before nobody has seen anything.
+            self.follow(LARGE_FULL_SCALE, conversion.finished);
             self.last = Some((*conversion, false));
             self.pending = None;
             return self.report;
@@ -273,10 +293,36 @@ impl ChannelCompare {
             // A repeated or disordered one adds no time.
             return self.report;
         }
+        self.integrate(config, &previous, conversion, spoiled);
+        let (a, b) = (previous.current, conversion.current);
+        let (a, b) = (a.saturating_abs(), b.saturating_abs());
+        let largest = if spoiled {
+            a.saturating_add(b)
+        } else {
+            a.max(b)
+        };
+        let zero = config.zero_tolerance.get(conversion.range);
+        let gain = config.gain_tolerance.get();
+        let off = mul_div(i64::from(largest.get()), i64::from(gain), 1_000_000);
+        let bound = largest
+            .saturating_add(zero)
+            .saturating_add(Microamps(clamp_i32(off)));
+        self.follow(bound, conversion.finished);
+        self.last = Some((*conversion, false));
+        self.report
+    }
+
+    fn integrate(
+        &mut self,
+        config: &CompareConfig,
+        previous: &Conversion,
+        conversion: &Conversion,
+        spoiled: bool,
+    ) {
         let (from, to) = (previous.finished, conversion.started);
         let gap = Gap {
             mean: Microamps(midpoint(previous.current, conversion.current)),
-            doubt: gap_doubt(config, &previous, conversion, spoiled),
+            doubt: gap_doubt(config, previous, conversion, spoiled),
             covered: elapsed(from, to).as_millis() <= u64::from(config.short_gap_ms),
         };
         // A report that came later than the conversion after it: the next one will do.
@@ -286,8 +332,7 @@ impl ChannelCompare {
             self.span_gap(config, &gap, from, to, conversion.range);
             self.note_begin(conversion.started);
             self.span(config, conversion, conversion.started, conversion.finished);
-            self.last = Some((*conversion, false));
-            return self.report;
+            return;
         };
         let end = point.at;
         self.span_gap(config, &gap, from, end.min(to), conversion.range);
@@ -298,19 +343,36 @@ impl ChannelCompare {
         // Inside one conversion only its mean is known.
         let step = i64::from(conversion.current.get()) - i64::from(previous.current.get());
         let length = elapsed(from, conversion.finished);
-        // Half of it, and a shift, not a division: that would be the only one of the compiler's own in 128 bits.
-        let edge = charge_of(step.abs(), length) >> 1;
-        self.integral.doubt = add_i128(self.integral.doubt, edge);
+        let edge = charge_of(step.abs(), length) / 2;
+        self.integral.doubt = self.integral.doubt.wrapping_add(edge);
         self.evaluate(config, point);
-        self.integral.doubt = add_i128(self.integral.doubt, edge);
+        self.integral.doubt = self.integral.doubt.wrapping_add(edge);
         self.span_gap(config, &gap, end.min(to), to, conversion.range);
         if end < to {
             self.note_begin(to);
         }
         self.span(config, conversion, end.max(to), conversion.finished);
         self.pending = None;
-        self.last = Some((*conversion, false));
-        self.report
+    }
+
+    /// No more than `bound` has flowed up to `to`: what of it a meter that stands still has missed.
+    #[inline(never)]
+    fn follow(&mut self, bound: Microamps, to: Instant) {
+        let (before, since) = self.flowed;
+        let flowed = before.saturating_add(units::charge_of(bound, elapsed(since, to)));
+        self.flowed = (flowed, to);
+        if let Some(count) = self.moved.as_mut().filter(|_| self.report.frozen) {
+            let missed = flowed.saturating_sub(core::mem::replace(&mut count.before, flowed));
+            self.declare(missed);
+        }
+        if let Some((before, _)) = self.ended.filter(|(_, until)| to >= *until) {
+            self.ended = None;
+            self.declare(flowed.saturating_sub(before));
+        }
+    }
+
+    const fn declare(&mut self, charge: Nanocoulombs) {
+        self.report.miscounted = self.report.miscounted.saturating_add(charge);
     }
 
     /// Takes the meter's newest report.
@@ -330,14 +392,23 @@ impl ChannelCompare {
         let point = MeterPoint::new(at, report);
         match self.moved {
             Some(count) if count.charge == report.charge_total => self.check_frozen(config, at),
-            _ => {
+            before => {
+                if let Some(count) = before.filter(|_| self.report.frozen) {
+                    self.ended = Some((count.before, at));
+                    // A window with a stand-still in it would count that once more.
+                    self.restart_windows();
+                }
                 self.moved = Some(Count {
                     at,
                     charge: report.charge_total,
+                    before: self.reported.0,
                     converter: None,
                 });
                 self.report.frozen = false;
             }
+        }
+        if at != self.reported.1 {
+            self.reported = (self.flowed.0, at);
         }
         let due = |window: &Option<Window>, length_ms: u32| {
             window.is_none_or(|window| elapsed(window.meter.at, at) >= milliseconds(length_ms))
@@ -352,7 +423,7 @@ impl ChannelCompare {
             Some(pending) => {
                 // No usable conversion for a whole window: there is nothing to wait for.
                 if elapsed(pending.at, at) >= milliseconds(config.fast_window_ms) {
-                    self.restart(false);
+                    self.restart(true);
                 }
             }
         }
@@ -362,18 +433,23 @@ impl ChannelCompare {
     /// The factors are others, in the converter at once and in the meter by `at`: the comparison begins anew there.
     pub fn restart_at(&mut self, at: Instant) {
         self.not_before = at;
-        self.restart(false);
+        self.restart(true);
     }
 
+    /// Compares from here on. A meter that stands still goes on doing so until it has counted, or its gap is bridged.
     fn restart(&mut self, keep_frozen: bool) {
-        self.fast = None;
-        self.slow = None;
-        self.pending = None;
-        self.moved = None;
+        self.restart_windows();
         self.last = None;
+        self.report.frozen &= keep_frozen;
+        if !self.report.frozen {
+            self.moved = None;
+        }
+    }
+
+    fn restart_windows(&mut self) {
+        (self.fast, self.slow, self.pending) = (None, None, None);
         self.report.fast = Outcome::Undecided;
         self.report.slow = Outcome::Undecided;
-        self.report.frozen &= keep_frozen;
     }
 
     #[inline(never)]
@@ -392,7 +468,8 @@ impl ChannelCompare {
     ) {
         let time = elapsed(from, to);
         self.add(config, gap.mean, range, time, gap.covered);
-        self.integral.doubt = add_i128(self.integral.doubt, charge_of(gap.doubt, time));
+        let doubt = charge_of(gap.doubt, time);
+        self.integral.doubt = self.integral.doubt.wrapping_add(doubt);
     }
 
     #[inline(never)]
@@ -405,16 +482,15 @@ impl ChannelCompare {
         covered: bool,
     ) {
         let charge = charge_of(i64::from(current.get()), time);
-        let gain = mul_i128(
-            div_i128(charge.abs(), 1_000_000),
-            i128::from(config.gain_tolerance.get().max(0)),
+        let gain = mul_div(
+            charge.saturating_abs(),
+            i64::from(config.gain_tolerance.get().max(0)),
+            i64::from(Ppm::ONE.get()),
         );
-        let zero = charge_of(
-            i64::from(config.zero_tolerance.get(range).get().max(0)),
-            time,
-        );
-        self.integral.charge = add_i128(self.integral.charge, charge);
-        self.integral.doubt = add_i128(self.integral.doubt, add_i128(gain, zero));
+        let zero = config.zero_tolerance.get(range).get().max(0);
+        let doubt = gain.wrapping_add(charge_of(i64::from(zero), time));
+        self.integral.charge = self.integral.charge.wrapping_add(charge);
+        self.integral.doubt = self.integral.doubt.wrapping_add(doubt);
         if covered {
             self.integral.covered = self.integral.covered.saturating_add(time.as_ticks());
         }
@@ -430,9 +506,22 @@ impl ChannelCompare {
             if matches!(outcome, Outcome::Disagree { .. }) {
                 self.report.disagreements = self.report.disagreements.saturating_add(1);
             }
+            self.declare_window(outcome);
         }
         if let Some(outcome) = close(&mut self.slow, &now, config.slow_window_ms, config) {
             self.report.slow = outcome;
+            self.declare_window(outcome);
+        }
+    }
+
+    /// What the meter may have miscounted, if it was the meter; twice where both windows say so. Of a stand-still its own bound
+    /// is declared.
+    #[inline(never)]
+    fn declare_window(&mut self, outcome: Outcome) {
+        if let Outcome::Disagree { difference, bound } = outcome
+            && !self.report.frozen
+        {
+            self.declare(difference.saturating_abs().saturating_add(bound));
         }
     }
 
@@ -457,10 +546,11 @@ impl ChannelCompare {
             return;
         };
         let since = self.integral.since(&then);
-        let counts = mul_wide(fast.meter.resolution.get(), FROZEN_COUNTS * 1_000);
-        let once = add_i128(since.doubt, counts);
-        let bound = add_i128(once, once);
-        if elapsed_at_least(since.covered, config.short_gap_ms) && since.charge.abs() > bound {
+        let counts = mul_i64(fast.meter.resolution.get(), FROZEN_COUNTS);
+        let once = Nanocoulombs(add_i64(since.doubt, counts));
+        let bound = once.saturating_add(once);
+        let charge = Nanocoulombs(since.charge).saturating_abs();
+        if elapsed_at_least(since.covered, config.short_gap_ms) && charge > bound {
             self.report.frozen = true;
         }
     }
@@ -493,10 +583,10 @@ fn gap_doubt(
     }
 }
 
-/// pC of a current in µA over a time.
-fn charge_of(microamps: i64, time: Duration) -> i128 {
+/// nC of a current in µA over a time.
+fn charge_of(microamps: i64, time: Duration) -> i64 {
     // 2⁶³ µs are 292,000 years.
-    mul_wide(microamps, time.as_ticks().cast_signed())
+    mul_div(time.as_ticks().cast_signed(), microamps, 1_000)
 }
 
 fn midpoint(a: Microamps, b: Microamps) -> i32 {
@@ -524,25 +614,24 @@ fn close(
         return None;
     }
     let measured = now.converter.since(&begun.converter);
-    let share = charge_of(1_000_000, Duration::from_ticks(measured.covered));
-    let needed = charge_of(i64::from(config.covered_share.get()), length);
-    let outcome = if share < needed {
+    let needed = mul_div(
+        length.as_ticks().cast_signed(),
+        i64::from(config.covered_share.get()),
+        i64::from(Ppm::ONE.get()),
+    );
+    let outcome = if measured.covered.cast_signed() < needed {
         Outcome::Undecided
     } else {
-        let meter = now.meter.charge.saturating_sub(begun.meter.charge);
-        let difference =
-            i128::from(meter.get()) - i128::from(clamp_i64(div_i128(measured.charge, 1_000)));
-        let uncertainty =
-            i128::from(now.meter.uncertainty.get()) - i128::from(begun.meter.uncertainty.get());
-        let bound = i128::from(clamp_i64(div_i128(measured.doubt, 1_000)))
-            + uncertainty.abs()
-            + i128::from(begun.meter.resolution.get())
-            + i128::from(now.meter.resolution.get());
-        if difference.abs() > bound {
-            Outcome::Disagree {
-                difference: Nanocoulombs(clamp_i64(difference)),
-                bound: Nanocoulombs(clamp_i64(bound)),
-            }
+        let (from, to) = (&begun.meter, &now.meter);
+        let meter = to.charge.saturating_sub(from.charge);
+        let difference = meter.saturating_sub(Nanocoulombs(measured.charge));
+        let uncertainty = to.uncertainty.saturating_sub(from.uncertainty);
+        let bound = Nanocoulombs(measured.doubt)
+            .saturating_add(uncertainty.saturating_abs())
+            .saturating_add(from.resolution)
+            .saturating_add(to.resolution);
+        if difference.saturating_abs() > bound {
+            Outcome::Disagree { difference, bound }
         } else {
             Outcome::Agree
         }
@@ -897,14 +986,14 @@ mod tests {
         let _ = compare.on_conversion(&config, &conversion(0, 100));
         let _ = compare.on_conversion(&config, &conversion(100, 200));
         let once = compare.integral;
-        assert_eq!((once.charge, once.covered), (100_000, 100));
+        assert_eq!((once.charge, once.covered), (100, 100));
         let _ = compare.on_conversion(&config, &conversion(100, 200));
         let _ = compare.on_conversion(&config, &conversion(300, 250));
         assert_eq!(compare.integral, once);
         // A gap is interpolated.
         let _ = compare.on_conversion(&config, &conversion(250, 300));
         assert_eq!(compare.integral.covered, 200);
-        assert_eq!(compare.integral.charge, 200_000);
+        assert_eq!(compare.integral.charge, 200);
     }
 
     #[test]
@@ -965,6 +1054,58 @@ mod tests {
         assert_eq!(report, CompareReport::default());
     }
 
+    #[test]
+    fn what_agrees_declares_nothing() {
+        let mut bench = Bench::new();
+        for ma in [40_000, -5_000, 0, 20] {
+            let report = bench.run(25_000, i64::from(ma), ma);
+            assert_eq!(report.miscounted, Nanocoulombs::ZERO, "{ma} mA");
+        }
+    }
+
+    #[test]
+    fn a_meter_stands_still_until_it_counts_even_with_no_converter() {
+        let mut bench = Bench::new();
+        bench.run(3_000, 40_000, 40_000);
+        assert!(bench.run(1_000, 0, 40_000).frozen);
+        bench.usable = false;
+        assert!(bench.run(3_000, 0, 500_000).frozen);
+        let now = bench.now;
+        bench.compare.restart_at(at(now));
+        assert!(bench.run(1_000, 0, 0).frozen);
+        bench.usable = true;
+        assert!(bench.run(500, 0, 40_000).frozen);
+        let report = bench.run(1_000, 40_000, 40_000);
+        assert!(!report.frozen);
+        let missed = 40_000 * 1_500_000 + 500_000 * 3_000_000_i64;
+        let declared = report.miscounted.get();
+        assert!(declared > missed, "{declared} of {missed}");
+        // Full scale for as long as nobody saw anything.
+        assert!(
+            declared < 600_000 * 4_100_000 + 70_000_000_000,
+            "{declared}"
+        );
+    }
+
+    #[test]
+    fn a_wrong_scale_is_declared_as_long_as_it_lasts() {
+        // 20 % is found in every fast window, 1.3 % more than what the fast one allows for in the slow one alone.
+        for (share_ppm, seconds) in [(1_200_000, 21), (800_000, 21), (1_040_000, 61)] {
+            let mut bench = Bench::new();
+            bench.run(11_000, 40_000, 40_000);
+            let wrong = 40_000 * share_ppm / 1_000_000;
+            bench.run(seconds * 1_000, wrong, 40_000);
+            let report = bench.run(31_000, 40_000, 40_000);
+            let off = (wrong - 40_000).abs() * seconds as i64 * 1_000_000;
+            let declared = report.miscounted.get();
+            assert!(
+                declared > off - off / 10,
+                "{share_ppm}: {declared} of {off}"
+            );
+            assert!(declared < 3 * off, "{share_ppm}: {declared} of {off}");
+        }
+    }
+
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(40))]
 
@@ -1019,6 +1160,38 @@ mod tests {
                     ..MeterReport::default()
                 });
             }
+        }
+
+        /// However long the meter stands still, and whatever flows meanwhile: what it has missed is declared once it counts
+        /// again, and not much more.
+        #[test]
+        fn what_a_meter_that_stood_still_has_missed_is_declared(
+            steps in prop::collection::vec((300_u64..3_000, 5_000_i32..60_000), 1..4),
+            sign in prop::bool::ANY,
+            begin in 0_u64..40,
+        ) {
+            let sign = if sign { 1 } else { -1 };
+            let mut bench = Bench::new();
+            bench.run(3_000 + begin, 40_000, 40_000);
+            let before = bench.compare.report().miscounted;
+            prop_assert_eq!(before, Nanocoulombs::ZERO);
+            let (mut missed, mut largest, mut time) = (0, 0, 0);
+            let mut found = false;
+            for (ms, ma) in &steps {
+                let ma = sign * ma;
+                found |= bench.run(*ms, 0, ma).frozen;
+                missed += i64::from(ma) * (*ms as i64) * 1_000;
+                largest = largest.max(i64::from(ma.abs()));
+                time += *ms as i64;
+            }
+            prop_assume!(found);
+            let report = bench.run(2_000, i64::from(sign) * 10_000, sign * 10_000);
+            prop_assert!(!report.frozen);
+            let declared = report.miscounted.get();
+            prop_assert!(declared >= missed.abs(), "{} of {}", declared, missed);
+            // Four conversions at the ends, two per cent and an ampere; the steps between conversions.
+            let slack = 250 * largest.max(40_000) * 1_000 + (largest / 20 + 1_000) * time * 1_000;
+            prop_assert!(declared <= missed.abs() + slack, "{} of {}", declared, missed);
         }
     }
 }

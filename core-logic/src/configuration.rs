@@ -25,7 +25,7 @@ use crate::design_parameters::{TEMPERATURE_HIGH, TEMPERATURE_LOW};
 use crate::front_end::PerRange;
 use crate::range::Range;
 use crate::storm::StormConfig;
-use crate::units::{Microamps, MilliCelsius, Ppm};
+use crate::units::{Microamps, MilliCelsius, Ppm, milliseconds};
 pub use fields::{FIELD_TEXTS, FIELDS, Field, FieldId, When};
 
 /// Version of the record. It changes with every change of [`Configuration`]'s shape.
@@ -57,7 +57,7 @@ pub enum Contradiction {
     Derived,
     /// The lowest temperature is not below the highest.
     Temperature,
-    /// The key calibration's longest delay does not leave time to settle.
+    /// The key calibration's longest delay does not leave time to settle and to take its samples at the converter's data rate.
     KeyCalibrationDelay,
     /// The slow window of the channels' comparison is not longer than the fast one.
     CompareWindows,
@@ -275,7 +275,7 @@ impl Configuration {
             Some(Contradiction::OpenSensor)
         } else if !self.temperature_limits.is_sorted_by(|low, high| low < high) {
             Some(Contradiction::Temperature)
-        } else if self.key_calibration.settle_ms >= self.key_calibration.max_delay_ms {
+        } else if !self.key_calibration_has_time() {
             Some(Contradiction::KeyCalibrationDelay)
         } else if self.compare.fast_window_ms >= self.compare.slow_window_ms {
             Some(Contradiction::CompareWindows)
@@ -286,6 +286,20 @@ impl Configuration {
         } else {
             self.ocv.validate().err().map(Contradiction::Ocv)
         }
+    }
+
+    /// Whether settling and a batch of samples end before the key calibration's longest delay.
+    const fn key_calibration_has_time(&self) -> bool {
+        let key = &self.key_calibration;
+        let period = self.converter.period(self.front_end.channel());
+        // One conversion is under way when the signal has settled.
+        let conversions = if key.enabled {
+            key.samples as u64 + 1
+        } else {
+            0
+        };
+        let needed = milliseconds(key.settle_ms).as_ticks() + conversions * period.as_ticks();
+        needed < milliseconds(key.max_delay_ms).as_ticks()
     }
 
     /// CRC-32 over every value, those that [`Configuration::derive`] makes included.
@@ -854,7 +868,7 @@ mod tests {
     #[test]
     fn each_contradiction_is_found() {
         type Change = fn(&mut Configuration);
-        let cases: [(Change, Contradiction); 9] = [
+        let cases: [(Change, Contradiction); 11] = [
             (
                 |c| c.converter.gain = crate::converter::Gain::X2,
                 Contradiction::Converter(crate::converter::ConverterConfigError::Gain),
@@ -874,6 +888,16 @@ mod tests {
             ),
             (
                 |c| c.key_calibration.settle_ms = c.key_calibration.max_delay_ms,
+                Contradiction::KeyCalibrationDelay,
+            ),
+            (
+                // 17 · 125 ms.
+                |c| c.converter.data_rate = crate::converter::DataRate::Sps8,
+                Contradiction::KeyCalibrationDelay,
+            ),
+            (
+                // 42 · 31.25 ms and 200 ms.
+                |c| c.key_calibration.samples = 41,
                 Contradiction::KeyCalibrationDelay,
             ),
             (

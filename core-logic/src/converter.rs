@@ -426,22 +426,6 @@ const fn evaluate(slope: i64, offset: i64, input: i32) -> i32 {
     clamp_i32_inline((slope * input as i64 + offset + (1 << (FRACTION_BITS - 1))) >> FRACTION_BITS)
 }
 
-/// `value · multiplier / divisor`, rounded to nearest, for a positive divisor: [`mul_div`] with 64-bit divisions alone
-/// wherever the parts fit, some ten times cheaper than one of 128 bits.
-#[inline(never)]
-const fn scale(value: i64, multiplier: i64, divisor: i64) -> i64 {
-    if multiplier == divisor {
-        return value;
-    }
-    let (Some(whole), Some(rest)) = (value.checked_div(divisor), value.checked_rem(divisor)) else {
-        return mul_div(value, multiplier, divisor);
-    };
-    match (whole.checked_mul(multiplier), rest.checked_mul(multiplier)) {
-        (Some(whole), Some(rest)) => whole.saturating_add(div_round(rest, divisor)),
-        _ => mul_div(value, multiplier, divisor),
-    }
-}
-
 #[inline(never)]
 fn fold(
     config: &ConverterConfig,
@@ -465,7 +449,7 @@ fn fold(
             let shift = FOLDING_BITS - magnitude_bits - u32::from(config.gain.log2());
             let actual = (micro(reference) * 1_000) << shift;
             let referred = if config.supply_mode == SupplyMode::Measured && !is_closed_loop {
-                scale(actual, micro(design::SENSOR_NOMINAL_SUPPLY), micro(supply))
+                mul_div(actual, micro(design::SENSOR_NOMINAL_SUPPLY), micro(supply))
             } else {
                 actual
             };
@@ -475,7 +459,7 @@ fn fold(
     let line = front_end.line(range, supply);
     let key = corrections.key_factors.of(range);
     let with_k = |nanovolts| {
-        scale(
+        mul_div(
             nanovolts,
             i64::from(key.k_ppb),
             i64::from(KeyFactors::K_ONE_PPB),
@@ -484,8 +468,8 @@ fn fold(
     let one = i64::from(Ppm::ONE.get());
     let gain = one + i64::from(corrections.gain.of(range).get());
     let to_microamps = |nanovolts| {
-        scale(
-            scale(nanovolts, line.numerator, line.denominator),
+        mul_div(
+            mul_div(nanovolts, line.numerator, line.denominator),
             gain,
             one,
         )
@@ -504,7 +488,7 @@ fn fold(
     let slope = folded(to_microamps(with_k(step)), input_bits);
     let limits = front_end.output_limits_at(range, supply);
     RangeCoefficients {
-        volts_slope: folded(scale(step, 1, 1_000), input_bits),
+        volts_slope: folded(mul_div(step, 1, 1_000), input_bits),
         slope,
         offset: folded(to_microamps(above_zero).saturating_sub(zero_drift), 0),
         saturated_low: limits.low.saturating_add(config.saturation_margin),
@@ -866,6 +850,7 @@ impl Converter {
     }
 
     /// The meter counts by other factors from about `at` on: how its mean moves until then says nothing of the current.
+    #[inline(never)]
     pub fn forget_meter_until(&mut self, at: Instant) {
         if let Some(run) = &mut self.run {
             run.since = run.since.max(at);
@@ -1769,12 +1754,6 @@ pub(crate) mod tests {
     }
 
     proptest! {
-        #[test]
-        fn scaling_is_exact(value: i64, multiplier: i64, divisor in 1..i64::MAX, small in 1..3_000_000_000_i64, by: i32) {
-            prop_assert_eq!(scale(value, multiplier, divisor), mul_div(value, multiplier, divisor));
-            prop_assert_eq!(scale(value, i64::from(by), small), mul_div(value, i64::from(by), small));
-        }
-
         #[test]
         fn folded_coefficients_agree_with_the_chain(
             front_end in any_valid(), rate in any_rate(), supply_mode in any_mode(), corrections in any_corrections(),

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::design_parameters as design;
 use crate::range::Range;
-use crate::units::{Microamps, Microvolts, clamp_i32, div_round, mul_div};
+use crate::units::{Microamps, Microvolts, add_i64, clamp_i32, div_round, mul_div, sub_i64};
 
 /// Turns of a [`ClosedLoop`] sensor that [`FrontEnd::validate`] accepts.
 pub const TURNS_LIMITS: (i32, i32) = (1, 20_000);
@@ -110,7 +110,7 @@ impl TransferLine {
     /// The current, rounded to the nearest µA, stopping at the ends of the type.
     #[must_use]
     pub const fn current(&self, volts: Microvolts) -> Microamps {
-        let above_zero = (volts.get() as i64 * 1_000).saturating_sub(self.zero_nanovolts);
+        let above_zero = sub_i64(volts.get() as i64 * 1_000, self.zero_nanovolts);
         Microamps(clamp_i32(mul_div(
             above_zero,
             self.numerator,
@@ -123,7 +123,7 @@ impl TransferLine {
     pub const fn voltage(&self, current: Microamps) -> Microvolts {
         let above_zero = mul_div(current.get() as i64, self.denominator, self.numerator);
         Microvolts(clamp_i32(div_round(
-            self.zero_nanovolts.saturating_add(above_zero),
+            add_i64(self.zero_nanovolts, above_zero),
             1_000,
         )))
     }
@@ -168,8 +168,8 @@ impl SupplyRelations {
     /// `k2·Vc + m2`, the output at 0 A, in nV, rounded to nearest.
     #[must_use]
     pub const fn zero_nanovolt(&self, supply: Microvolts) -> i64 {
-        mul_div(self.k2_nanovolt_per_volt, supply.get() as i64, 1_000_000)
-            .saturating_add(self.m2_nanovolt)
+        let by_supply = mul_div(self.k2_nanovolt_per_volt, supply.get() as i64, 1_000_000);
+        add_i64(by_supply, self.m2_nanovolt)
     }
 }
 
@@ -530,7 +530,7 @@ pub(crate) const fn network_output_nanovolts(hall_nanovolts: i64) -> i64 {
         design::R1_OHM + design::R2_OHM,
         (design::R3_OHM + design::R4_OHM) * design::R2_OHM,
     );
-    mul_div(hall_nanovolts, gain, per).saturating_add(reference)
+    add_i64(mul_div(hall_nanovolts, gain, per), reference)
 }
 
 #[cfg(test)]

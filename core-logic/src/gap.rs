@@ -13,7 +13,9 @@
 
 use crate::meter::MeterConfig;
 use crate::range::Range;
-use crate::units::{Duration, Instant, Microamps, Nanocoulombs, Ppm, clamp_i32, elapsed, mul_div};
+use crate::units::{
+    Duration, Instant, Microamps, Nanocoulombs, Ppm, charge_of, clamp_i32, elapsed, mul_div,
+};
 
 /// From one conversion's end to the next one's begin: a tick, with which ADC1 converts, and its jitter.
 const PAUSE: Duration = Duration::from_ticks(12_000);
@@ -101,12 +103,6 @@ pub fn converter_error(config: &MeterConfig, current: Microamps) -> Microamps {
         .bridge_offset
         .saturating_abs()
         .saturating_add(Microamps(clamp_i32(gain)))
-}
-
-/// µA · µs / 1000 = nC
-fn charge_of(current: Microamps, time: Duration) -> Nanocoulombs {
-    let time = i64::try_from(time.as_ticks()).unwrap_or(i64::MAX);
-    Nanocoulombs(mul_div(time, i64::from(current.get()), 1_000))
 }
 
 impl Gap {

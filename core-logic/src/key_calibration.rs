@@ -25,7 +25,8 @@ use crate::design_parameters::SENSOR_ZERO;
 use crate::front_end::KeyFactors;
 use crate::range::Range;
 use crate::units::{
-    Duration, Instant, Microamps, Microvolts, Nanocoulombs, clamp_i32, div_round, elapsed, mul_div,
+    Duration, Instant, Microamps, Microvolts, Nanocoulombs, abs_i64, clamp_i32, div_round, elapsed,
+    mul_div, sub_i64,
 };
 
 /// The vehicle's key.
@@ -554,9 +555,9 @@ fn first_factor(config: &KeyCalibrationConfig, off_output: Microvolts) -> Result
         one,
         i64::from(off_output.get()),
     );
-    let deviation = k.saturating_sub(one);
-    let allowed = i64::from(config.max_k_deviation_ppm).saturating_mul(1_000);
-    if off_output <= Microvolts::ZERO || deviation.saturating_abs() > allowed {
+    let deviation = sub_i64(k, one);
+    let allowed = i64::from(config.max_k_deviation_ppm) * 1_000;
+    if off_output <= Microvolts::ZERO || abs_i64(deviation) > allowed {
         return Err(KeyRefusal::KOutOfLimits(clamp_i32(div_round(
             deviation, 1_000,
         ))));

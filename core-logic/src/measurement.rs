@@ -40,8 +40,8 @@ use crate::sliding_average::{Average, SlidingAverage};
 use crate::soc::{CellVoltage, Soc, SocCoefficients, SocInput, SocReading};
 use crate::supply_calibration::{Run, SupplyCalibration, SupplyPoint};
 use crate::units::{
-    Duration, Instant, Microamps, Microvolts, MilliCelsius, Millivolts, Nanocoulombs, Ppm,
-    clamp_i32, div_round, elapsed, mul_div,
+    Duration, Instant, Microamps, Microvolts, MilliCelsius, Millivolts, Nanocoulombs, Ppm, add_i64,
+    clamp_i32, div_round, elapsed, mul_div, sub_i64,
 };
 use crate::validity::Validity;
 use crate::zero_drift::{ZeroCalibration, ZeroConditions, ZeroRefusal};
@@ -263,7 +263,9 @@ pub struct Measurement {
     compare: ChannelCompare,
     meter: MeterReport,
     gap: Gap,
-    /// As much of the meter's doubt as the state of charge has in its own.
+    /// What faults have miscounted that were found: a meter that stood still or disagreed, a flag against the level.
+    miscounted: Nanocoulombs,
+    /// As much of the charge's doubt as the state of charge has in its own.
     doubted: Nanocoulombs,
     meter_causes: Validity,
     /// [`Measurement::meter_config`] is another one since it was taken.
@@ -349,15 +351,15 @@ pub fn effective_meter_config(
             line.voltage(configuration.zero_drift.value.get(range))
                 .get(),
         );
-        let input_at_zero = mul_div(
+        let scaled = mul_div(
             zero_at_input,
             i64::from(KeyFactors::K_ONE_PPB),
             i64::from(factors.k_ppb),
-        )
-        .saturating_sub(i64::from(factors.a.get()));
+        );
+        let input_at_zero = sub_i64(scaled, i64::from(factors.a.get()));
         let sensor_zero_at_zero = line.current(Microvolts(clamp_i32(input_at_zero))).get();
         let shift = mul_div(shift_error, line.numerator, line.denominator);
-        let offset = i64::from(sensor_zero_at_zero).saturating_add(shift);
+        let offset = add_i64(i64::from(sensor_zero_at_zero), shift);
         let gain = mul_div(
             mul_div(
                 one + i64::from(meter.gain.get(range).get()),
@@ -470,6 +472,7 @@ impl Measurement {
             compare: ChannelCompare::new(),
             meter: MeterReport::default(),
             gap: Gap::new(now),
+            miscounted: Nanocoulombs::ZERO,
             doubted: Nanocoulombs::ZERO,
             meter_causes: Validity::STALE,
             meter_calibration_changed: true,
@@ -655,10 +658,18 @@ impl Measurement {
         self.meter_causes = causes
             .and_if(report.at.is_none(), Validity::STALE)
             .and_if(report.lost, Validity::CHIP_FAULT);
-        self.compare.on_meter(&configuration.compare, &report);
-        let doubt = report.uncertainty.saturating_sub(self.doubted);
+        let was_frozen = self.compare.report().frozen;
+        let compared = self.compare.on_meter(&configuration.compare, &report);
+        if was_frozen {
+            // Its mean falls and rises again, whatever flows: nothing to hold against the converter.
+            self.converter
+                .forget_meter_until(report.at.unwrap_or(self.now));
+        }
+        self.miscounted = compared.miscounted.saturating_add(self.flag.miscounted);
+        let declared = report.uncertainty.saturating_add(self.miscounted);
+        let doubt = declared.saturating_sub(self.doubted);
         if doubt > Nanocoulombs::ZERO {
-            self.doubted = report.uncertainty;
+            self.doubted = declared;
             self.soc.declare_loss(&self.prepared.soc, doubt);
         }
         let now = report.at.unwrap_or(self.now);
@@ -1193,9 +1204,12 @@ impl Measurement {
         )
     }
 
-    /// The meter's own, and what the reset may have cost.
+    /// The meter's own, what faults have miscounted, and what the reset may have cost.
     const fn charge_uncertainty(&self) -> Nanocoulombs {
-        self.meter.uncertainty.saturating_add(self.loss)
+        self.meter
+            .uncertainty
+            .saturating_add(self.miscounted)
+            .saturating_add(self.loss)
     }
 
     fn charge_validity(&self) -> Validity {
@@ -1265,6 +1279,7 @@ impl Measurement {
             charge: self.meter.charge_total,
             validity: self.charge_validity(),
             estimated: self.loss != Nanocoulombs::ZERO
+                || self.miscounted != Nanocoulombs::ZERO
                 || self.meter.estimated_intervals > 0
                 || self.meter.gaps > 0,
         }
@@ -1415,7 +1430,11 @@ impl Measurement {
             Activity::None
         };
         readings.activity_progress = percent(taken, of);
-        (readings.command_state, readings.command_reason) = self.order_outcome;
+        // What was found is a setting only once the next tick has handed it over.
+        (readings.command_state, readings.command_reason) = match self.found {
+            Some(_) => (CommandState::Running, 0),
+            None => self.order_outcome,
+        };
         readings.supply_points = [points.0, points.1];
         readings.key_calibration_state = u16::from(self.key_outputs.phase.number());
         readings.current = self.reading.current;

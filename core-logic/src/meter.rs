@@ -70,8 +70,9 @@ use crate::front_end::PerRange;
 use crate::gap::{GapBridge, converter_error};
 use crate::range::{Range, RangeHistory, RangeInterval};
 use crate::units::{
-    Duration, Instant, Microamps, Nanocoulombs, Ppm, add_i128, clamp_i32, clamp_i64, div_round,
-    div_round_i128, elapsed, milliseconds, mul_div, mul_i128, mul_wide, sub_i128,
+    Duration, Instant, Microamps, Nanocoulombs, Ppm, abs_i64, abs_i128, add_i64, add_i128,
+    clamp_i32, clamp_i64, div_round, div_round_i128, elapsed, milliseconds, mul_div, mul_i128,
+    mul_wide, sub_i64, sub_i128,
 };
 
 /// Binary digits of a picocoulomb in which charge is summed.
@@ -343,17 +344,14 @@ impl Accumulator {
         // Split at the picocoulomb first: a shift, so that the division needs 64 bits only.
         let picocoulombs = clamp_i64(sum >> FRACTION_BITS);
         let fraction = clamp_i64(sum & ((1 << FRACTION_BITS) - 1));
-        self.whole = self.whole.saturating_add(picocoulombs.div_euclid(1_000));
+        self.whole = add_i64(self.whole, picocoulombs.div_euclid(1_000));
         self.carry = (picocoulombs.rem_euclid(1_000) << FRACTION_BITS) + fraction;
     }
 
     /// To the nearest nC.
     #[inline(never)]
     const fn rounded(&self) -> Nanocoulombs {
-        Nanocoulombs(
-            self.whole
-                .saturating_add((self.carry >= NANOCOULOMB / 2) as i64),
-        )
+        Nanocoulombs(add_i64(self.whole, (self.carry >= NANOCOULOMB / 2) as i64))
     }
 }
 
@@ -762,7 +760,7 @@ impl MeterChannel {
         if self.booked.last.is_some() {
             // The hidden bits of the newest reading.
             uncertainty.add(i128::from(self.booked.last_scale) / 2);
-            uncertainty.add(self.booked.pending.saturating_abs());
+            uncertainty.add(abs_i128(self.booked.pending));
         }
         let magnitude = self.mean_current.saturating_abs();
         MeterReport {
@@ -782,7 +780,7 @@ impl MeterChannel {
             estimated_intervals: self.estimated_intervals,
             gaps: self.gaps,
             // Rounded up, with the rounding of the total itself.
-            uncertainty: Nanocoulombs(uncertainty.whole.saturating_add(2)),
+            uncertainty: Nanocoulombs(add_i64(uncertainty.whole, 2)),
         }
     }
 
@@ -876,10 +874,8 @@ impl MeterChannel {
             .min(charge_of(span, estimated)),
             charge_of(switching_current, stamps),
         );
-        self.uncertainty.add(times(
-            doubt,
-            self.coefficients.step.get(short).saturating_abs(),
-        ));
+        self.uncertainty
+            .add(times(doubt, abs_i64(self.coefficients.step.get(short))));
         if interval.edges == 1 && estimated.as_ticks() <= 2 * design::SNAPSHOT_DEADLINE_US {
             ReadingOutcome::Integrated
         } else {
@@ -932,7 +928,7 @@ impl MeterChannel {
     fn doubt_small_sensor(&mut self, counts: i32, shared: bool, interval: &RangeInterval) {
         let time = interval.length().min(LONGEST_INTERVAL);
         let PerRange { small, large } = self.config.full_scale;
-        let counted = mul_wide(i64::from(counts), self.booked.last_scale).saturating_abs();
+        let counted = abs_i128(mul_wide(i64::from(counts), self.booked.last_scale));
         let beyond = |current: Microamps| sub_i128(counted, charge_of(current, time)).max(0);
         let doubt = if shared {
             self.coefficients
@@ -960,15 +956,10 @@ impl MeterChannel {
         // No further than from one end of the large range to the other.
         let full = self.config.full_scale.large.saturating_abs().get();
         let span = clamp_i32(clamp_i64(i128::from(slew).min(2 * i128::from(full))));
-        let of_shape = times(
-            charge_of(Microamps(span), interval.small),
-            excess.saturating_abs(),
-        );
+        let of_shape = times(charge_of(Microamps(span), interval.small), abs_i64(excess));
         let misjudged =
             u64::from(self.config.front_end_delay_us).saturating_add(design::EDGE_STAMP_DELAY_US);
-        let of_times = self
-            .misscaled(Duration::from_ticks(misjudged), Range::Small)
-            .saturating_abs();
+        let of_times = abs_i128(self.misscaled(Duration::from_ticks(misjudged), Range::Small));
         add_i128(of_shape, of_times)
     }
 
@@ -1039,7 +1030,7 @@ impl MeterChannel {
             let pending = self.booked.pending;
             self.booked.pending = 0;
             if self.booked.sign == 0 {
-                self.uncertainty.add(mul_i128(pending.saturating_abs(), 2));
+                self.uncertainty.add(mul_i128(abs_i128(pending), 2));
             }
             self.book(mul_i128(pending, i128::from(sign)));
         }
@@ -1085,7 +1076,7 @@ impl MeterChannel {
     /// Mean current of the `length` since the total was `before`; 0 for no time.
     fn mean_since(&self, before: Accumulator, length: Duration) -> Microamps {
         // nC per µs is mA.
-        let counted = self.booked.total.whole.saturating_sub(before.whole);
+        let counted = sub_i64(self.booked.total.whole, before.whole);
         let ticks = i64::try_from(length.as_ticks()).unwrap_or(i64::MAX);
         Microamps(clamp_i32(mul_div(counted, 1_000, ticks)))
     }

@@ -108,6 +108,7 @@ pub struct Counters {
     pub character_gaps: u32,
 }
 
+#[inline(never)]
 fn count(counter: &mut u32) {
     *counter = counter.saturating_add(1);
 }

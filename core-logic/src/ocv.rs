@@ -9,7 +9,7 @@ use core::fmt;
 use serde::{Deserialize, Serialize};
 
 use crate::design_parameters::OCV_IMPLAUSIBLE_BEYOND;
-use crate::units::{Microvolts, Ppm, clamp_i32, div_round, mul_i64};
+use crate::units::{Microvolts, Ppm, add_i64, clamp_i32, div_round, mul_i64};
 
 /// Points that a table holds at most: steps of 5 %.
 pub const MAX_POINTS: usize = 21;
@@ -233,7 +233,7 @@ fn interpolate(points: impl Iterator<Item = (i32, i32)>, x: i32) -> i32 {
             let rise = i64::from(y1) - i64::from(y0);
             let along = i64::from(x) - i64::from(x0);
             // |rise · along| < 2^65 only for a table that is not valid; saturating keeps that harmless.
-            return clamp_i32(i64::from(y0).saturating_add(div_round(mul_i64(rise, along), run)));
+            return clamp_i32(add_i64(i64::from(y0), div_round(mul_i64(rise, along), run)));
         }
         previous = Some((x1, y1));
     }

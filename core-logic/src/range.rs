@@ -7,7 +7,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::design_parameters as design;
-use crate::units::{Duration, Instant, Microamps, elapsed};
+use crate::units::{Duration, Instant, Microamps, Nanocoulombs, charge_of, elapsed};
 
 /// The sensor that the analog switch passes, as the range flag says.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -223,14 +223,15 @@ impl RangeHistory {
     }
 
     /// Whether a conversion that began at `started` must not be used, this history being taken when its result was
-    /// read: an edge fell into it, or came less than `settling` before it, or came between its end and the reading.
+    /// read: an edge fell into it, or came less than `settling` before it, or came between its end and the reading, or
+    /// edges are not listened to.
     ///
     /// The last is deliberate. Of several edges a history tells only the newest, so an edge after the conversion may
     /// hide one inside it; and this history's range would no longer be the one that was converted.
     #[must_use]
     pub fn conversion_spoiled(&self, started: Instant, settling: Duration) -> bool {
-        self.last_edge
-            .is_some_and(|edge| edge >= started || elapsed(edge, started) < settling)
+        let edge = |edge| edge >= started || elapsed(edge, started) < settling;
+        !self.watched || self.last_edge.is_some_and(edge)
     }
 }
 
@@ -419,11 +420,14 @@ pub struct FlagReport {
     pub implausible: bool,
     /// The range that the current calls for, by its magnitude, if the level shows it.
     pub expected: Option<Range>,
-    /// The sensor whose level the switch passes, as measured: the scale to be used, whatever the flag says. `None`
-    /// where it cannot be decided; the flag is then all there is.
+    /// The sensor whose level the switch passes, as measured. `None` where it cannot be decided; the flag is then all there
+    /// is. The readings stay on the flag's scale, and doubted, even so: edges and times in the two ranges are the flag's.
     pub passed: Option<Range>,
     /// How often a contradiction was reported; stops at the type's end.
     pub episodes: u32,
+    /// Bound of the charge that contradictions which were reported have miscounted since the start, from the last agreement
+    /// before to the first one after.
+    pub miscounted: Nanocoulombs,
 }
 
 /// Flag against measured level.
@@ -444,6 +448,10 @@ pub struct FlagReport {
 pub struct FlagPlausibility {
     /// Since when the raw finding differs from the reported one.
     differs_since: Option<Instant>,
+    /// The newest look: when, and by how much the current was off on the flag's scale.
+    last: Option<(Instant, Microamps)>,
+    /// Miscounted since the last agreement by a contradiction that is not reported yet.
+    unreported: Nanocoulombs,
     report: FlagReport,
 }
 
@@ -453,11 +461,14 @@ impl FlagPlausibility {
     pub const fn new() -> Self {
         Self {
             differs_since: None,
+            last: None,
+            unreported: Nanocoulombs::ZERO,
             report: FlagReport {
                 implausible: false,
                 expected: None,
                 passed: None,
                 episodes: 0,
+                miscounted: Nanocoulombs::ZERO,
             },
         }
     }
@@ -475,6 +486,17 @@ impl FlagPlausibility {
             || large_stays_behind(config, observation);
         self.report.expected = expected;
         self.report.passed = passed;
+        let off = if contradiction {
+            off_by(config, observation, passed)
+        } else {
+            Microamps::ZERO
+        };
+        if let Some((at, before)) = self.last {
+            let doubt = charge_of(off.max(before), elapsed(at, observation.at));
+            self.unreported = self.unreported.saturating_add(doubt);
+        }
+        self.last = Some((observation.at, off));
+        let was_implausible = self.report.implausible;
         if contradiction == self.report.implausible {
             self.differs_since = None;
         } else {
@@ -487,6 +509,12 @@ impl FlagPlausibility {
                 }
             }
         }
+        if was_implausible || self.report.implausible {
+            let unreported = core::mem::take(&mut self.unreported);
+            self.report.miscounted = self.report.miscounted.saturating_add(unreported);
+        } else if !contradiction {
+            self.unreported = Nanocoulombs::ZERO;
+        }
         self.report
     }
 
@@ -496,8 +524,10 @@ impl FlagPlausibility {
             differs_since: None,
             report: FlagReport {
                 episodes: self.report.episodes,
+                miscounted: self.report.miscounted,
                 ..Self::new().report
             },
+            ..Self::new()
         };
         self.report
     }
@@ -530,6 +560,29 @@ fn passed_sensor(config: &FlagPlausibilityConfig, seen: &FlagObservation) -> Opt
         (true, false) => Some(Range::Small),
         (false, true) if not_small => Some(Range::Large),
         _ => None,
+    }
+}
+
+/// By how much the current may be off on the flag's scale, where flag and level contradict each other.
+fn off_by(
+    config: &FlagPlausibilityConfig,
+    seen: &FlagObservation,
+    passed: Option<Range>,
+) -> Microamps {
+    let (small, large) = (seen.passed_as_small, seen.passed_as_large);
+    let by_flag = match seen.flag {
+        Range::Small => small,
+        Range::Large => large,
+    };
+    match (passed, seen.small_sensor) {
+        (Some(passed), _) if passed == seen.flag => Microamps::ZERO,
+        (Some(_), _) | (None, None) => large.saturating_sub(small).saturating_abs(),
+        (None, Some(own)) if own.saturating_abs() < config.small_full_scale => own
+            .saturating_sub(by_flag)
+            .saturating_abs()
+            .saturating_add(config.margin_below.saturating_abs()),
+        // The small sensor is at its end, and what is passed is no sensor's level: anything may flow.
+        (None, Some(_)) => design::LARGE_FULL_SCALE.saturating_add(by_flag.saturating_abs()),
     }
 }
 
@@ -998,6 +1051,81 @@ mod tests {
                 .step(&config, &observation(190, Range::Small, 58.0, None))
                 .implausible
         );
+    }
+
+    /// Looks every 31 ms at a flag that is stuck from 0.5 to `end_ms`, the small sensor being passed or the large one.
+    fn miscounted(flag: Range, passed: Range, amps: f64, end_ms: u64, network: bool) -> FlagReport {
+        let config = FlagPlausibilityConfig::default();
+        let mut plausibility = FlagPlausibility::new();
+        let microamps = |amps: f64| Microamps((amps * 1e6) as i32);
+        let level = match passed {
+            Range::Small => amps.clamp(-66.0, 66.0),
+            Range::Large => amps / 10.0,
+        };
+        for ms in (0..end_ms + 500).step_by(31) {
+            let is_stuck = (500..end_ms).contains(&ms);
+            plausibility.step(
+                &config,
+                &FlagObservation {
+                    at: at(ms * 1_000),
+                    flag: if is_stuck { flag } else { passed },
+                    passed_as_small: microamps(level),
+                    passed_as_large: microamps(10.0 * level),
+                    small_sensor: network.then(|| microamps(amps.clamp(-66.0, 66.0))),
+                },
+            );
+        }
+        plausibility.report()
+    }
+
+    #[test]
+    fn what_a_stuck_flag_has_miscounted_is_declared() {
+        for (flag, passed, amps, network) in [
+            (Range::Large, Range::Small, 30.0, true),
+            (Range::Large, Range::Small, -30.0, true),
+            (Range::Large, Range::Small, 4.0, true),
+            (Range::Large, Range::Small, 4.0, false),
+            (Range::Small, Range::Large, 100.0, true),
+            (Range::Small, Range::Large, -250.0, true),
+        ] {
+            let report = miscounted(flag, passed, amps, 2_500, network);
+            assert!(report.episodes == 1 && !report.implausible, "{report:?}");
+            let counted = if flag == Range::Large {
+                10.0 * amps
+            } else {
+                amps / 10.0
+            };
+            let off_c = (counted - amps).abs() * 2.0;
+            let declared_c = report.miscounted.get() as f64 / 1e9;
+            assert!(declared_c >= off_c, "{amps} A: {declared_c} of {off_c} C");
+            // A look more at either end, and the margin of a sensor's own level.
+            let margin_c = 2.2 * (f64::from(design::FLAG_MARGIN_BELOW.get()) / 1e6);
+            assert!(
+                declared_c <= 1.05 * off_c + margin_c,
+                "{amps} A: {declared_c} of {off_c} C"
+            );
+        }
+        // Not long enough to be reported, and an OR gate that is stuck: the flag says what is passed.
+        assert_eq!(
+            miscounted(Range::Large, Range::Small, 30.0, 550, true).miscounted,
+            Nanocoulombs::ZERO
+        );
+        let stuck_gate = miscounted(Range::Large, Range::Large, 30.0, 2_500, true);
+        assert!(stuck_gate.implausible, "{stuck_gate:?}");
+        assert_eq!(stuck_gate.miscounted, Nanocoulombs::ZERO);
+    }
+
+    #[test]
+    fn unwatched_edges_spoil_a_conversion() {
+        let mut recorder = EdgeRecorder::new(at(0), false);
+        let spoiled = |recorder: &EdgeRecorder| {
+            recorder
+                .history(at(9_000))
+                .conversion_spoiled(at(8_000), us(5_000))
+        };
+        assert!(!spoiled(&recorder));
+        recorder.suspend();
+        assert!(spoiled(&recorder));
     }
 
     #[test]

@@ -13,7 +13,8 @@ use serde::{Deserialize, Serialize};
 use crate::front_end::KeyFactors;
 use crate::soc::SocRetained;
 use crate::units::{
-    Duration, Instant, Microamps, MilliCelsius, Millivolts, Nanocoulombs, Ppm, elapsed, mul_div,
+    Duration, Instant, Microamps, MilliCelsius, Millivolts, Nanocoulombs, Ppm, add_i64, elapsed,
+    mul_div,
 };
 use crate::validity::Validity;
 
@@ -309,11 +310,11 @@ impl SavePolicyConfig {
         let in_time = |us: i64| mul_div(current, us, 1_000);
         let interval = self
             .charge_interval
-            .get()
             .saturating_abs()
+            .get()
             .min(in_time(i64::from(self.time_interval_s) * 1_000_000));
         let meanwhile = in_time(i64::try_from(latency.as_ticks()).unwrap_or(i64::MAX));
-        Nanocoulombs(interval.saturating_add(meanwhile))
+        Nanocoulombs(add_i64(interval, meanwhile))
     }
 }
 

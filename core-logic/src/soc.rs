@@ -470,11 +470,9 @@ impl Soc {
     #[must_use]
     pub fn reading(&self, coefficients: &SocCoefficients) -> SocReading {
         SocReading {
-            presented: coefficients.share(
-                self.kept
-                    .remaining
-                    .saturating_add(self.kept.presented_offset),
-            ),
+            presented: coefficients.share(Nanocoulombs(
+                self.kept.remaining.get() + self.kept.presented_offset.get(),
+            )),
             estimate: coefficients.share(self.kept.remaining),
             uncertainty: coefficients.share(self.kept.uncertainty),
             remaining: self.kept.remaining,
@@ -510,7 +508,7 @@ impl Soc {
     fn integrate(&mut self, coefficients: &SocCoefficients, delta: i64) {
         let mut remaining = self.kept.remaining.get() - delta;
         if delta >= 0 {
-            self.kept.discharged.0 = add_i64(self.kept.discharged.get(), delta);
+            self.kept.discharged.0 = self.kept.discharged.get().saturating_add(delta);
             self.slack = (self.slack + delta).min(EFFICIENCY_BAND.get());
         } else {
             self.kept.charged.0 = sub_i64(self.kept.charged.get(), delta);
@@ -537,9 +535,9 @@ impl Soc {
     /// Presented and estimated value both lie between empty and full, so that neither sticks to an end.
     fn keep_presented_inside(&mut self, coefficients: &SocCoefficients) {
         let remaining = self.kept.remaining.get();
-        let presented = remaining
-            .saturating_add(self.kept.presented_offset.get())
-            .clamp(0, coefficients.capacity);
+        // Either is at most a capacity.
+        let presented =
+            (remaining + self.kept.presented_offset.get()).clamp(0, coefficients.capacity);
         self.kept.presented_offset.0 = presented - remaining;
     }
 
@@ -548,9 +546,9 @@ impl Soc {
         let time_us = i64::try_from(time.as_ticks()).unwrap_or(i64::MAX);
         let step = coefficients.slew_per_us.saturating_mul(time_us) >> SLEW_PLACES;
         self.kept.presented_offset.0 = if offset > 0 {
-            sub_i64(offset, step).max(0)
+            (offset - step).max(0)
         } else {
-            add_i64(offset, step).min(0)
+            (offset + step).min(0)
         };
         self.keep_presented_inside(coefficients);
     }
@@ -565,7 +563,8 @@ impl Soc {
     }
 
     fn age(&mut self, coefficients: &SocCoefficients) {
-        let throughput = self.kept.charged.saturating_add(self.kept.discharged).get();
+        let (charged, discharged) = (self.kept.charged.get(), self.kept.discharged.get());
+        let throughput = charged.saturating_add(discharged);
         let new = throughput
             .saturating_sub(self.aged_throughput)
             .unsigned_abs();
@@ -575,7 +574,8 @@ impl Soc {
         self.aged_throughput = throughput;
         self.pending_us = 0;
         self.pending_idle_us = 0;
-        self.grow_uncertainty(coefficients, add_i64(add_i64(gain, offset), no_load));
+        let grown = gain.saturating_add(offset).saturating_add(no_load);
+        self.grow_uncertainty(coefficients, grown);
     }
 
     fn look_at_rest(

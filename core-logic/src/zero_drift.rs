@@ -9,7 +9,7 @@ use crate::converter::CurrentReading;
 use crate::design_parameters as design;
 use crate::front_end::PerRange;
 use crate::range::Range;
-use crate::units::{Duration, Instant, Microamps, clamp_i32, div_round, elapsed};
+use crate::units::{Duration, Instant, Microamps, add_i64, clamp_i32, div_round, elapsed};
 
 /// Readings of a calibration that [`ZeroDriftConfig::is_valid`] accepts.
 pub const SAMPLE_LIMITS: (u16, u16) = (4, 1_024);
@@ -305,7 +305,7 @@ fn take(
         return None;
     }
     let mean = div_round(run.sum, i64::from(run.taken));
-    let value = Microamps(clamp_i32(i64::from(run.in_use.get()).saturating_add(mean)));
+    let value = Microamps(clamp_i32(add_i64(i64::from(run.in_use.get()), mean)));
     let result = config
         .check_value(run.range, value)
         .map(|value| ZeroResult {

@@ -128,12 +128,13 @@ impl<SPI: SpiDevice> Flash<SPI> {
     }
 
     async fn wait(&mut self, limit_ms: u32) -> Result<(), Error<SPI::Error>> {
-        for _ in 0..limit_ms {
+        for _ in 0..=limit_ms {
             if self.status()? & STATUS_BUSY == 0 {
                 return Ok(());
             }
             app::alive(Task::Storage);
-            Mono::delay(1.millis()).await;
+            // The next tick: a delay lasts one longer than it is asked for.
+            Mono::delay_until(Mono::now() + 1.millis()).await;
         }
         Err(Error::Timeout)
     }

@@ -70,11 +70,13 @@ pub fn fill(identity: &Identity, readings: &mut Readings) {
 
 /// Charge that the largest current moves while nobody counts over a reset.
 pub fn loss_over_reset(previous: &Previous, policy: &SavePolicyConfig) -> Nanocoulombs {
-    // The pin alone (every other reset pulls it too): RAM outlives it, but nobody knows how long it was held.
-    if previous.cause.bits() == ResetCause::PIN {
+    let bits = previous.cause.bits();
+    // The pin alone (every other reset pulls it too), or a supply that sagged and did not break down: RAM outlives both, but
+    // nobody knows how long it took.
+    if bits == ResetCause::PIN || bits & ResetCause::BROWN_OUT != 0 {
         return loss_over_power_off(policy);
     }
-    let by_watchdog = previous.cause.bits() & ResetCause::WATCHDOG != 0;
+    let by_watchdog = bits & ResetCause::WATCHDOG != 0;
     let time = if by_watchdog {
         RESTART.saturating_add(WATCHDOG_PERIOD)
     } else {

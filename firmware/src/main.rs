@@ -137,6 +137,8 @@ mod app {
         store: ConfigurationStore,
         /// To the storage task, until it is done: save, restore or clear the log.
         request: Option<Command>,
+        /// To it as well, and first: the configuration is damaged, what is stored is to be loaded.
+        is_damaged: bool,
         /// Generation of the configuration that the flash holds.
         saved: Option<u32>,
         flash_counters: [u32; 5],
@@ -222,6 +224,7 @@ mod app {
             administration: Administration {
                 store,
                 request: None,
+                is_damaged: false,
                 saved: None,
                 flash_counters: [0; 5],
             },
@@ -559,7 +562,8 @@ mod app {
         for waited_ms in first_ms..=PollPace::limit_ms(config.data_rate) {
             let code = match converter.poll(config)? {
                 Progress::Busy => {
-                    Mono::delay(1.millis()).await;
+                    // The next tick: a delay lasts one longer than it is asked for.
+                    Mono::delay_until(Mono::now() + 1.millis()).await;
                     continue;
                 }
                 Progress::Discarded => None,
@@ -713,10 +717,7 @@ mod app {
                 cx.shared.administration.lock(|administration| {
                     let store = &mut administration.store;
                     let damaged = check && store.stage().is_err();
-                    if damaged {
-                        // An order that is being served comes first; the next check asks again.
-                        administration.request.get_or_insert(Command::Restore);
-                    }
+                    administration.is_damaged |= damaged;
                     if let Some(found) = found
                         && let Ok(active) = store.stage()
                     {
@@ -1039,7 +1040,11 @@ mod app {
         center: &mut impl rtic::Mutex<T = Center>,
         administration: &mut impl rtic::Mutex<T = Administration>,
     ) -> bool {
-        let request = administration.lock(|administration| administration.request);
+        let (request, is_damaged) =
+            administration.lock(|administration| match administration.is_damaged {
+                true => (Some(Command::Restore), true),
+                false => (administration.request, false),
+            });
         let mut defaulted = false;
         let done = match request {
             None => return false,
@@ -1095,7 +1100,9 @@ mod app {
             CommandState::Failed
         };
         center.lock(|center| {
-            center.measurement.note_command(state, 0);
+            if !is_damaged {
+                center.measurement.note_command(state, 0);
+            }
             if defaulted {
                 center
                     .conditions
@@ -1104,12 +1111,14 @@ mod app {
             }
         });
         administration.lock(|administration| {
-            // An order that has come meanwhile is still to be served.
-            if administration.request == request {
+            if is_damaged {
+                administration.is_damaged = false;
+            } else if administration.request == request {
+                // An order that has come meanwhile is still to be served.
                 administration.request = None;
             }
-        });
-        false
+            administration.request == Some(Command::ClearLog)
+        })
     }
 
     /// Once per turn of the storage task: its conditions; once a second the state, and at times the stack.

@@ -34,6 +34,8 @@ const ATTEMPTS: u8 = 3;
 const NEAR_ZERO: u32 = 1_024;
 /// Length of the self-test with channel 1 shorted: 900 counts at full scale, so that its few are the chip's own offset.
 pub const SELF_TEST_MS: u32 = 100;
+/// A turn of the read-back at which MODE is read.
+const MODE: u8 = 0;
 /// While the chip does not answer it is configured anew this often.
 const RETRY: Duration = Duration::from_ticks(40_000);
 
@@ -146,7 +148,7 @@ impl Meter {
     ///
     /// A temperature conversion may still be waiting, for ever: see [`Meter::temperature`].
     pub fn is_fresh(&mut self) -> bool {
-        self.holds_mode() != Ok(true)
+        self.holds_twice(MODE) != Ok(true)
     }
 
     /// Whether MODE is as configured. A reset clears it, and a line stuck low reads it as 0.
@@ -242,7 +244,7 @@ impl Meter {
             }
             // The fall of AENERGY to 0 by a reset could be taken for a current.
             if reading.energy.unsigned_abs() < NEAR_ZERO {
-                match self.holds_mode() {
+                match self.holds_twice(MODE) {
                     Ok(true) => {}
                     Ok(false) => {
                         self.lose(reading.at, 0);
@@ -287,10 +289,32 @@ impl Meter {
             }
             return false;
         }
-        let expected = configuration();
         let turn = self.verify_turn;
         self.verify_turn = (turn + 1) % 10;
-        let held = match turn {
+        match self.holds_twice(turn) {
+            Ok(true) => {
+                self.health.dead_bus = false;
+                return turn.is_multiple_of(2);
+            }
+            // A disturbed transfer: the next turn looks again.
+            Err(Error::Checksum { .. }) => self.note_repeat(0, &Error::NotConfigured),
+            Ok(false) | Err(_) => self.lose(now, turn),
+        }
+        false
+    }
+
+    /// Whether the register of a turn is as configured. What CHKSUM does not see disturbed is read once more: a chip that is taken
+    /// for reset loses what it has counted.
+    fn holds_twice(&mut self, turn: u8) -> Result<bool, Error<spi::Error>> {
+        match self.holds(turn) {
+            Ok(false) => self.holds(turn),
+            read => read,
+        }
+    }
+
+    fn holds(&mut self, turn: u8) -> Result<bool, Error<spi::Error>> {
+        let expected = configuration();
+        match turn {
             1 => self.chip.read::<Gain>().map(|gain| gain == expected.gain),
             3 => self
                 .chip
@@ -311,17 +335,7 @@ impl Meter {
                 .read::<Status>()
                 .map(|Status(flags)| !flags.contains(Interrupts::RESET)),
             _ => self.holds_mode(),
-        };
-        match held {
-            Ok(true) => {
-                self.health.dead_bus = false;
-                return turn.is_multiple_of(2);
-            }
-            // A disturbed transfer: the next turn looks again.
-            Err(Error::Checksum { .. }) => self.note_repeat(0, &Error::NotConfigured),
-            Ok(false) | Err(_) => self.lose(now, turn),
         }
-        false
     }
 
     /// The chip has lost its configuration, as this turn of the read-back shows: gives it back.

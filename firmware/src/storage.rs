@@ -55,6 +55,7 @@ pub struct Counters {
 #[expect(clippy::cast_possible_truncation, reason = "4 KiB")]
 const SECTOR: u32 = flash::SECTOR as u32;
 
+#[inline(never)]
 fn count(counter: &mut u32) {
     *counter = counter.saturating_add(1);
 }

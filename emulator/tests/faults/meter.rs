@@ -346,6 +346,42 @@ fn fault_f07_a_crystal_off_or_stopped() {
         // 1 s, and the 100 ms between two frames.
         assert!(found_s <= 1.1, "{current_a} A: {found_s}");
     }
+    // What was never counted stays missing: once the charge is valid again it is declared.
+    for current_a in [40.0, 5.0, -300.0] {
+        let mut rig = steady(current_a);
+        rig.run_s(1.0).unwrap();
+        let before = charges_c(&mut rig);
+        let bound_before_c = charge_bound_c(&rig);
+        strike(&mut rig, "F7:stopped,3s");
+        rig.run_s(0.5).unwrap();
+        let mut valid = 0;
+        watch(&mut rig, 2.4, |rig| {
+            valid += usize::from(rig.view.charge_c().validity == 0)
+        });
+        assert_eq!(valid, 0, "valid while nobody counts");
+        rig.run_s(0.1).unwrap();
+        // ChannelsDisagree, which it was as well, stands for 10 s.
+        let again_s = until(&mut rig, "a valid charge", 10.2, |rig| {
+            rig.view.charge_c().validity == 0
+        });
+        rig.run_s(0.5).unwrap();
+        let error_c = charge_error_c(&mut rig, before);
+        let declared_c = charge_bound_c(&rig) - bound_before_c;
+        println!(
+            "F7 stopped for 3 s at {current_a} A: valid again {again_s:.2} s later, error {error_c:.2} C, declared \
+             {declared_c:.2} C"
+        );
+        assert!(
+            (error_c + 3.0 * current_a).abs() < 0.05 * 3.0 * current_a.abs(),
+            "{error_c}"
+        );
+        assert!(error_c.abs() <= declared_c, "{error_c} {declared_c}");
+        assert!(
+            declared_c < 1.5 * error_c.abs() + 5.0,
+            "{error_c} {declared_c}"
+        );
+        assert_eq!(rig.view.signal("Charge", "ChargeEstimated"), Some(1.0));
+    }
 }
 
 #[test]

@@ -138,6 +138,8 @@ fn fault_f10_a_flag_against_the_level_is_found_and_the_charge_is_doubted() {
     for (stuck, current_a) in [("high", 30.0), ("low", 100.0), ("low", -250.0)] {
         let mut rig = steady(current_a);
         rig.run_s(0.5).unwrap();
+        let before = charges_c(&mut rig);
+        let bound_before_c = charge_bound_c(&rig);
         strike(&mut rig, &format!("F10:{stuck},1s"));
         let doubted_s = until(&mut rig, "a doubted current", 0.5, |rig| {
             rig.view.current_a().validity & validity::IMPLAUSIBLE != 0
@@ -150,12 +152,19 @@ fn fault_f10_a_flag_against_the_level_is_found_and_the_charge_is_doubted() {
         });
         let charge = rig.view.charge_c();
         rig.run_s(2.5).unwrap();
+        let error_c = charge_error_c(&mut rig, before);
+        let declared_c = charge_bound_c(&rig) - bound_before_c;
         println!(
             "F10 {stuck} at {current_a} A: current doubted after {:.0} ms, FlagImplausible on CAN after {:.0} ms, charge \
-             meanwhile {charge:?}",
+             meanwhile {charge:?}, in the end {error_c:.1} C off, declared {declared_c:.1} C",
             doubted_s * 1e3,
             named_s * 1e3
         );
+        // The charge is valid again, and off: that is declared.
+        assert_eq!(rig.view.charge_c().validity, 0);
+        assert!(error_c.abs() > 50.0, "{error_c}");
+        assert!(error_c.abs() <= declared_c, "{error_c} {declared_c}");
+        assert!(declared_c < 1.3 * error_c.abs(), "{error_c} {declared_c}");
         // 200 ms, and the frame that says so.
         assert!(doubted_s <= 0.21, "{doubted_s}");
         assert!(named_s <= 0.3, "{named_s}");
