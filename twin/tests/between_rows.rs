@@ -181,3 +181,26 @@ fn a_delay_hides_neither_a_gain_nor_an_offset() {
         assert!(["delay", "lag"].contains(&time), "{}", report.summary);
     }
 }
+
+/// A reference has noise of its own, and a window evens it out, which no delay does: that is no reason to call a delay a window.
+#[test]
+fn a_delay_behind_a_noisy_reference_is_no_window_for_certain() {
+    const DELAY_ROWS: usize = 3;
+    // So slow that a window of some rows leaves it as it is.
+    let current: Vec<f64> = (0..ROWS * FINE)
+        .map(|k| k as f64 * FINE_S)
+        .map(|t| 60.0 * (t / 5.0).sin() + 20.0 * (0.5 * t + 0.3 * (0.13 * t).sin()).sin())
+        .collect();
+    let reading: Vec<f64> = (0..current.len())
+        .map(|k| current[k.saturating_sub(DELAY_ROWS * FINE)])
+        .collect();
+    for seed in 0..4 {
+        let mut own = noise(seed + 50, 0.25 * NOISE_A);
+        let noisy: Vec<f64> = current.iter().map(|i| i + own()).collect();
+        let report = of(&noisy, &reading, NOISE_A, seed);
+        let named = report.effects.iter().any(|effect| {
+            effect.id == "delay" || effect.equivalent_to.iter().any(|id| id == "delay")
+        });
+        assert!(named, "{seed}: {} {:?}", report.summary, report.decisions);
+    }
+}

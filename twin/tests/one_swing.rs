@@ -75,6 +75,20 @@ fn a_core_that_saturates_once_is_not_certainly_a_rail() {
     assert!(covered >= 5, "{covered} of 6");
 }
 
+/// Of the other rail's side only the lowest reading of all is near it: noise, and no rail.
+#[test]
+fn the_lowest_reading_is_no_rail() {
+    for seed in 0..12 {
+        let report = explained(seed, false, |i| i.min(180.0));
+        let clipping = report.effects.iter().find(|effect| effect.id == "clipping");
+        let Some(clipping) = clipping else {
+            panic!("{seed}: {:?}", report.summary);
+        };
+        let names = clipping.parameters.iter().map(|one| one.name.as_str());
+        assert!(names.eq(["high_a"]), "{seed}: {:?}", clipping.parameters);
+    }
+}
+
 #[test]
 fn a_rail_that_readings_stay_at_is_seen_without_any_other_swing() {
     const HIGH_A: f64 = 180.0;

@@ -1,10 +1,11 @@
 //! What the readings themselves show without any simulation: a grid of values, a rail.
 
 use super::losses::share;
-use super::obstacle::{FLOOR, obstacle};
+use super::obstacle::{CERTAIN, FLOOR, obstacle};
 use super::{Named, percent};
 use crate::explain::fit::{Fit, fit};
 use crate::explain::normal::dot;
+use crate::explain::robust::loss;
 use crate::explain::workbench::{Member, Workbench};
 
 /// A simulation that is rounded may be off by this many times the variance of rounding more than one that is not: by once where
@@ -119,7 +120,7 @@ fn missed(bench: &Workbench<'_>, mut now: Fit) -> Fit {
     now
 }
 
-/// Switches off what does nothing (a rail that no reading reaches).
+/// Switches off what does nothing: a rail that no reading reaches, or so few that chance does as much.
 pub(super) fn idle_off(bench: &Workbench<'_>, now: &mut Fit) {
     for m in 0..now.model.members.len() {
         let parameters = now.model.members[m].effect.card().parameters;
@@ -129,10 +130,26 @@ pub(super) fn idle_off(bench: &Workbench<'_>, now: &mut Fit) {
             }
             let mut model = now.model.clone();
             model.members[m].values[p] = parameter.off;
-            // The same to the last digit: all that was found for the model stands.
-            if bench.run(&model) == now.predicted {
+            let predicted = bench.run(&model);
+            if predicted == now.predicted {
+                // The same to the last digit: all that was found for the model stands.
                 now.model = model;
+            } else if is_set(&model.members[m]) && !is_missed(bench, now, &predicted) {
+                *now = Fit::of(bench, model, now.cost);
             }
         }
     }
+}
+
+/// Whether something is left of an effect.
+fn is_set(member: &Member) -> bool {
+    let parameters = member.effect.card().parameters.iter();
+    let mut values = parameters.zip(&member.values);
+    values.any(|(parameter, value)| parameter.off.is_infinite() && value.is_finite())
+}
+
+/// Whether readings tell a simulation from one without a part of it, beyond chance.
+fn is_missed(bench: &Workbench<'_>, with: &Fit, without: &[f64]) -> bool {
+    let without = loss(&bench.residual(without), with.sigma);
+    without - loss(&with.residual, with.sigma) > 0.5 * CERTAIN * CERTAIN
 }

@@ -8,6 +8,7 @@ use super::obstacle::{apart, at_end, beside, obstacle, only_aligns, small};
 use super::{Named, percent};
 use crate::effects::{Effect, find};
 use crate::explain::fit::{Fit, fit};
+use crate::explain::quieter::only_quietens;
 use crate::explain::robust::loss;
 use crate::explain::screen::screen;
 use crate::explain::workbench::{Member, Model, Workbench};
@@ -17,6 +18,12 @@ use crate::explain::workbench::{Member, Model, Workbench};
 const RIVALS: f64 = 0.1;
 /// An effect would do as well as another if it takes at least this share of what that one takes.
 const EQUAL: f64 = 0.5;
+
+/// Share of the error by which what works between the rows may be better than another for noise of the reference alone, that it evens
+/// out more of: a reference has less than a third of the reading's noise.
+const QUIETER: f64 = 0.1;
+/// What evens out more has at most this share of the other's bends.
+const SMOOTHER: f64 = 0.9;
 
 /// Effects that may stand in an effect's place: those that it is said to look like, those that are said to look like it, and
 /// the best of a screening of what it explains.
@@ -240,11 +247,22 @@ pub(super) fn name(
 }
 
 /// Whether a model, whose last effect has the place of one of the chosen model, does as well as that one: what the other effects'
-/// equations, and uneven stamps, may be off by does not decide between two.
+/// equations, and uneven stamps, may be off by does not decide between two, nor does what only evens out noise of the reference.
 pub fn does_as_well(bench: &Workbench<'_>, other: &Fit, chosen: &Fit, index: usize) -> bool {
     let between = |member: &Member| member.effect.card().stage.is_between_rows();
     let last = other.model.members.last();
     let stamped = between(&chosen.model.members[index]) && last.is_some_and(between);
     let may_be_off = beside(bench, chosen, index) + if stamped { bench.stamped() } else { 0.0 };
-    apart(bench, &chosen.predicted, &other.predicted) < may_be_off || !beaten(bench, other, chosen)
+    apart(bench, &chosen.predicted, &other.predicted) < may_be_off
+        || !beaten(bench, other, chosen)
+        || (stamped
+            && roughness(&chosen.predicted) < SMOOTHER * roughness(&other.predicted)
+            && share(bench, other, chosen) < QUIETER
+            && only_quietens(bench, other, chosen))
+}
+
+/// Energy of the second differences: what evens out noise has less.
+fn roughness(series: &[f64]) -> f64 {
+    let bends = series.windows(3).map(|s| s[0] - 2.0 * s[1] + s[2]);
+    bends.map(|bend| bend * bend).sum()
 }
