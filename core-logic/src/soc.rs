@@ -535,9 +535,9 @@ impl Soc {
     /// Presented and estimated value both lie between empty and full, so that neither sticks to an end.
     fn keep_presented_inside(&mut self, coefficients: &SocCoefficients) {
         let remaining = self.kept.remaining.get();
-        // Either is at most a capacity.
+        // What was restored may be any number.
         let presented =
-            (remaining + self.kept.presented_offset.get()).clamp(0, coefficients.capacity);
+            add_i64(remaining, self.kept.presented_offset.get()).clamp(0, coefficients.capacity);
         self.kept.presented_offset.0 = presented - remaining;
     }
 
@@ -545,6 +545,7 @@ impl Soc {
         let offset = self.kept.presented_offset.get();
         let time_us = i64::try_from(time.as_ticks()).unwrap_or(i64::MAX);
         let step = coefficients.slew_per_us.saturating_mul(time_us) >> SLEW_PLACES;
+        // Of opposite signs: neither sum leaves the type.
         self.kept.presented_offset.0 = if offset > 0 {
             (offset - step).max(0)
         } else {

@@ -6,7 +6,7 @@ use core_logic::{
     diagnosis::Code,
     modbus::Readings,
     retained::SavePolicyConfig,
-    units::{Duration, Nanocoulombs, clamp_i64},
+    units::{Duration, Nanocoulombs, charge_of},
 };
 use stm32f4xx_hal::signature::Uid;
 
@@ -82,9 +82,7 @@ pub fn loss_over_reset(previous: &Previous, policy: &SavePolicyConfig) -> Nanoco
     } else {
         RESTART
     };
-    // µA · µs / 1000 = nC
-    let charge = i128::from(LARGE_FULL_SCALE.get()) * i128::from(time.as_ticks()) / 1_000;
-    Nanocoulombs(clamp_i64(charge))
+    charge_of(LARGE_FULL_SCALE, time)
 }
 
 /// Charge that can have moved since the last record in flash, which this policy wrote.

@@ -1040,11 +1040,10 @@ mod app {
         center: &mut impl rtic::Mutex<T = Center>,
         administration: &mut impl rtic::Mutex<T = Administration>,
     ) -> bool {
-        let (request, is_damaged) =
-            administration.lock(|administration| match administration.is_damaged {
-                true => (Some(Command::Restore), true),
-                false => (administration.request, false),
-            });
+        let (request, is_damaged) = administration.lock(|administration| {
+            let own = administration.is_damaged.then_some(Command::Restore);
+            (own.or(administration.request), own.is_some())
+        });
         let mut defaulted = false;
         let done = match request {
             None => return false,

@@ -173,15 +173,8 @@ pub(super) fn fits(bench: &Workbench<'_>, models: Vec<Model>) -> Vec<Fit> {
         .collect()
 }
 
-/// The best single addition of some, if it is accepted.
-fn step(
-    bench: &Workbench<'_>,
-    now: &Fit,
-    models: Vec<Model>,
-    placebo_p99: f64,
-    decisions: &mut Vec<String>,
-    refused: &mut Vec<String>,
-) -> Option<(Fit, f64)> {
+/// Fits with their held-out losses, the lowest first, and the spread that they are in: the least of all.
+fn ranked(bench: &Workbench<'_>, now: &Fit, models: Vec<Model>) -> (Vec<(Fit, f64)>, f64) {
     let fits = fits(bench, models);
     let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
     let mut ranked: Vec<(Fit, f64)> = fits
@@ -192,6 +185,19 @@ fn step(
         })
         .collect();
     ranked.sort_by(|a, b| a.1.total_cmp(&b.1));
+    (ranked, sigma)
+}
+
+/// The best single addition of some, if it is accepted.
+fn step(
+    bench: &Workbench<'_>,
+    now: &Fit,
+    models: Vec<Model>,
+    placebo_p99: f64,
+    decisions: &mut Vec<String>,
+    refused: &mut Vec<String>,
+) -> Option<(Fit, f64)> {
+    let (ranked, sigma) = ranked(bench, now, models);
     let (_, before) = losses(bench, now, sigma);
     let candidates = ranked
         .into_iter()
@@ -281,16 +287,7 @@ fn pair(
         // One more branch of the first is no second effect.
         .filter(|model| model.members.len() == now.model.members.len() + 2)
         .collect();
-    let fits = fits(bench, models);
-    let sigma = fits.iter().map(|fit| fit.sigma).fold(now.sigma, f64::min);
-    let mut ranked: Vec<(Fit, f64)> = fits
-        .into_iter()
-        .map(|fit| {
-            let loss = losses(bench, &fit, sigma).1;
-            (fit, loss)
-        })
-        .collect();
-    ranked.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let (ranked, _) = ranked(bench, now, models);
     let best = ranked
         .into_iter()
         .take(PAIRS)
