@@ -48,7 +48,7 @@ use strays::{name_by_place, slips};
 use told::{attribute, base_found, effects, fitted, plots, sentence, short, times_found};
 use trust::{vague, wavering};
 use unfitted::{Unfitted, confirmed, not_there, veto};
-use verdict::{doubt, judge, unavoidable};
+use verdict::{Doubt, doubt, judge, unavoidable};
 use workbench::Workbench;
 
 /// Folds for the figures of held-out blocks, each with a fit of its own.
@@ -238,13 +238,13 @@ fn tell(
         verdict,
         left,
         held,
+        doubted,
         beside,
         elsewhere,
         placed,
         vetoed,
         ..
     } = decided;
-    let doubted = beside.is_some();
     let model = &selection.fit.model;
 
     if bench.is_white() {
@@ -276,9 +276,7 @@ fn tell(
     };
     attribute(&read, shown, &mut locations);
     report.locations.extend(locations);
-    report
-        .effects
-        .extend(effects(bench, &selection, beside.unwrap_or(0.0)));
+    report.effects.extend(effects(bench, &selection, beside));
     report
         .holdouts
         .extend(others.iter().map(|other| other.report(model)));
@@ -332,8 +330,9 @@ struct Decided {
     verdict: Verdict,
     left: Explainable,
     held: Held,
-    /// See [`doubt`].
-    beside: Option<f64>,
+    /// See [`verdict::Doubt`].
+    doubted: bool,
+    beside: f64,
     /// Whether it was decided on what each reading says beyond those before it.
     on_white: bool,
     /// See [`elsewhere::elsewhere`].
@@ -412,7 +411,11 @@ fn decide(
     );
     let held = folds(bench, &selection.fit);
     let not_there = not_there(bench, &selection, others);
-    let (verdict, beside) = doubt(
+    let Doubt {
+        verdict,
+        names: doubted,
+        beside,
+    } = doubt(
         bench,
         &mut selection,
         verdict,
@@ -436,6 +439,7 @@ fn decide(
         verdict,
         left,
         held,
+        doubted,
         beside,
         elsewhere,
         placed,

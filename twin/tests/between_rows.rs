@@ -122,6 +122,33 @@ fn a_window_and_a_lag_are_as_long_as_they_are() {
     }
 }
 
+/// A lag's equation is an idealisation, but where no more than noise is left it is not off by a gain's size: refused, the gain
+/// would make the lag 0.015 s shorter.
+#[test]
+fn a_gain_beside_a_lag_or_a_window_is_named_and_leaves_it_its_time() {
+    const LENGTH_S: f64 = 0.5;
+    let load = load();
+    let lagged = low_pass(&load, LENGTH_S);
+    let averaged = window(&load, (LENGTH_S / FINE_S) as usize);
+    for (slow, id, bias) in [
+        (lagged, "lag", STEP_S * STEP_S / (12.0 * LENGTH_S)),
+        (averaged, "moving-average", STEP_S * STEP_S / LENGTH_S),
+    ] {
+        let reading: Vec<f64> = slow.iter().map(|current| 1.01 * current).collect();
+        for seed in 0..3 {
+            let report = of(&load, &reading, 0.5 * NOISE_A, seed);
+            let value_of = |id: &str| {
+                let found = report.effects.iter().find(|effect| effect.id == id);
+                let found = found.unwrap_or_else(|| panic!("{id} {seed}: {}", report.summary));
+                &found.parameters[0]
+            };
+            let gain = value_of("gain");
+            assert!((gain.value - 1.01).abs() < 1e-3, "{seed}: {gain:?}");
+            assert_near(value_of(id), LENGTH_S, bias);
+        }
+    }
+}
+
 /// Steps of half a second to six seconds, in A, through a low-pass of the first order: a kink at each step.
 fn blunted_steps(seed: u64, tau_s: f64) -> Vec<f64> {
     let mut random = noise(seed ^ 0x5eed, 1.0);

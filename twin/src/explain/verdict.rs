@@ -34,7 +34,7 @@ const TRACES: f64 = 0.05;
 /// stated noise.
 const DOUBTED: f64 = 0.0025;
 /// What is left has to have this many times the energy of the stated noise to be beyond it: noise is stated to five percent at best.
-const STATED: f64 = 1.1;
+pub(super) const STATED: f64 = 1.1;
 /// Of fewer means than this their spread tells nothing.
 const LEAST_MEANS: usize = 8;
 
@@ -241,7 +241,7 @@ pub(super) fn unavoidable(bench: &Workbench<'_>, fit: &Fit, seed: u64) -> f64 {
 
 /// The least energy that the design lets be left: what is unavoidable, or what the reference's own zero, the readings' steps and
 /// moments that may all be off together make of readings. (What a gain that is off makes, the fit takes.)
-fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
+pub(super) fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
     let stated = Accuracy {
         gain: 0.0,
         scatter: 0.0,
@@ -264,9 +264,18 @@ fn swing(bench: &Workbench<'_>, coloured: Coloured) -> f64 {
     select::CERTAIN * coloured.rms.powi(2) * (2.0 * coloured.tau_s / span_s).sqrt()
 }
 
+/// What [`doubt`] makes of a verdict.
+#[derive(Default)]
+pub(super) struct Doubt {
+    pub verdict: Verdict,
+    /// Whether the names are doubted.
+    pub names: bool,
+    /// Energy that may be another physics' ([`intervals::intervals`]).
+    pub beside: f64,
+}
+
 /// The verdict once more: names whose values waver, or that leave what follows the inputs, are the best of the library and no
-/// more; and where all names were taken back for that, the mismatch is still there. If names are doubted, with the energy that may
-/// be another physics' ([`intervals::intervals`]).
+/// more; and where all names were taken back for that, the mismatch is still there.
 pub(super) fn doubt(
     bench: &Workbench<'_>,
     selection: &mut Selection,
@@ -275,16 +284,20 @@ pub(super) fn doubt(
     (confirmed, taken_back): (bool, bool),
     (not_there, placed): (Option<(f64, String)>, Option<&str>),
     unavoidable: f64,
-) -> (Verdict, Option<f64>) {
+) -> Doubt {
+    let sure = |verdict| Doubt {
+        verdict,
+        ..Doubt::default()
+    };
     if taken_back && verdict == Verdict::NoMismatch {
         selection.decisions.push(
             "There is a mismatch, yet the only effects that take it are not named: unknown.".into(),
         );
-        return (Verdict::Unknown, None);
+        return sure(Verdict::Unknown);
     }
     // What contradicts the effects' size confirms nothing.
     if (confirmed && not_there.is_none()) || selection.named.is_empty() {
-        return (verdict, None);
+        return sure(verdict);
     }
     let slips = slipped(bench, &selection.plain, &selection.fit);
     let energy = |fit: &Fit| without_rows(&fit.residual, &slips);
@@ -339,7 +352,13 @@ pub(super) fn doubt(
     doubts.extend(placed.map(str::to_owned));
     doubts.extend(quietening(bench, &selection.fit));
     if doubts.is_empty() {
-        return (verdict, None);
+        // What is left moves the values, however sure the names are.
+        let real = signs.iter().filter(|(_, real, _)| *real);
+        let most = real.map(|(share, ..)| *share).fold(0.0, f64::max);
+        return Doubt {
+            beside: most * explained,
+            ..sure(verdict)
+        };
     }
     selection.decisions.push(format!(
         "{}: the best of the library, yet {}: another physics of much the same shape may be behind it.",
@@ -350,7 +369,11 @@ pub(super) fn doubt(
         .iter()
         .map(|(share, ..)| *share)
         .fold(elsewhere, f64::max);
-    (Verdict::Ambiguous, Some(most * explained))
+    Doubt {
+        verdict: Verdict::Ambiguous,
+        names: true,
+        beside: most * explained,
+    }
 }
 
 /// What is to be said of effects between the rows that noise of the reference would look the same as. All of them are asked together: of

@@ -8,6 +8,7 @@ use crate::explain::robust::huber;
 use crate::explain::shape::without_memory;
 use crate::explain::slope::change;
 use crate::explain::told::short;
+use crate::explain::verdict::{STATED, allowed};
 use crate::explain::workbench::{Member, Model, Workbench};
 
 /// A named effect takes away at least this share of the held-out squared error (2 % of the held-out rms), overall or where it
@@ -20,6 +21,8 @@ const PAIRED: f64 = 3.0;
 /// Standard deviations of the stated noise that an effect has to be away from nothing: one in a thousand recordings has an effect
 /// of some thirty by chance that is 4.2 away.
 pub const CERTAIN: f64 = 4.2;
+/// An equation is off along one effect by at most this many times the energy of what is left of the readings beyond noise.
+const ALONG: f64 = 4.0;
 /// Rows where an effect changes the reading by at least this share of its largest change are where it acts.
 const ACTS: f64 = 0.2;
 
@@ -226,7 +229,8 @@ pub(super) fn apart(bench: &Workbench<'_>, one: &[f64], other: &[f64]) -> f64 {
     dot(&change, &change)
 }
 
-/// Energy by which the other effects' equations may be off, those of the model file among them.
+/// Energy by which the other effects' equations may be off, those of the model file among them: as idealisations, and as far as what
+/// is left of the readings allows.
 pub(super) fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
     let members = &fit.model.members;
     let others: f64 = (0..members.len())
@@ -240,7 +244,20 @@ pub(super) fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
             share * share * apart(bench, &fit.predicted, &without)
         })
         .sum();
-    bench.modelled + others
+    (bench.modelled + others).min(shown(bench, fit))
+}
+
+/// The most energy by which equations may be off along one effect, for what is left shows none of it: a wrong equation is not off along
+/// that effect alone. Without a bound where no noise is stated, or where more than white noise as it is stated comes through.
+fn shown(bench: &Workbench<'_>, fit: &Fit) -> f64 {
+    let stated = bench.problem.noise;
+    let cuts = |member: &Member| member.effect.cuts();
+    if stated <= 0.0 || bench.problem.coloured.rms > 0.0 || fit.model.members.iter().any(cuts) {
+        return f64::INFINITY;
+    }
+    let allowed = allowed(bench, stated * stated * bench.len() as f64);
+    let left = dot(&fit.residual, &fit.residual) - allowed;
+    ALONG * left.max((STATED - 1.0) * allowed)
 }
 
 /// Whether a model owes what it gains to the alignment of samples that its effect sets free, and not to the effect.
