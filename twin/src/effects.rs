@@ -290,6 +290,15 @@ fn within_a_period(time_s: f64, held_s: f64) -> Option<&'static str> {
     (time_s <= WHOLE_ROWS * held_s).then_some(sampled_window::SampledWindow.card().id)
 }
 
+/// An error of the recorded current that does to a battery what an effect does.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum CurrentError {
+    /// Off by so many A.
+    Offset(f64),
+    /// So many times the true one.
+    Gain(f64),
+}
+
 /// An effect of the library.
 pub trait Effect: Sync {
     /// What is said of it.
@@ -406,6 +415,16 @@ pub trait Effect: Sync {
     /// The effect that does the same where readings stay for `held_s`, though the design says that each is new: what a reading holds
     /// is then part of a period.
     fn when_held(&self, _values: &[f64], _held_s: f64) -> Option<&'static str> {
+        None
+    }
+
+    /// What the recorded current would be off by if that, and not this effect, were behind a battery's voltage.
+    fn in_the_current(&self, _values: &[f64], _scale: &Scale) -> Option<CurrentError> {
+        None
+    }
+
+    /// Why values within the bounds can hardly be what the effect says, if so.
+    fn unlikely(&self, _values: &[f64]) -> Option<&'static str> {
         None
     }
 

@@ -45,7 +45,9 @@ use fit::Fit;
 use flexible::{Explainable, Features};
 use select::Selection;
 use strays::{name_by_place, slips};
-use told::{attribute, base_found, effects, fitted, plots, sentence, short, times_found};
+use told::{
+    attribute, base_found, current_off, effects, fitted, plots, sentence, short, times_found,
+};
 use trust::{vague, wavering};
 use unfitted::{Unfitted, confirmed, not_there, veto};
 use verdict::{Doubt, doubt, judge, unavoidable};
@@ -241,7 +243,7 @@ fn tell(
         doubted,
         beside,
         elsewhere,
-        placed,
+        but,
         vetoed,
         ..
     } = decided;
@@ -300,6 +302,10 @@ fn tell(
     report
         .remarks
         .extend(times_found(&read, &selection.fit, between));
+    let off = current_off(bench, &selection, false).into_iter();
+    report
+        .remarks
+        .extend(off.map(|off| format!("{}: {off}", problem.name)));
     if verdict != Verdict::Unknown {
         report.remarks.extend(slips(&read, shown, verdict));
     }
@@ -307,7 +313,7 @@ fn tell(
     let mut sentence = sentence(
         bench,
         &selection,
-        (verdict, doubted, [elsewhere.as_deref(), placed.as_deref()]),
+        (verdict, doubted, [elsewhere.as_deref(), but.as_deref()]),
         left,
         (&vetoed, report),
     );
@@ -337,8 +343,8 @@ struct Decided {
     on_white: bool,
     /// See [`elsewhere::elsewhere`].
     elsewhere: Option<String>,
-    /// See [`name_by_place`].
-    placed: Option<String>,
+    /// What is held against a name: [`name_by_place`], [`current_off`].
+    but: Option<String>,
     /// What was taken back for a file that was never fitted.
     vetoed: Vec<&'static str>,
 }
@@ -429,7 +435,9 @@ fn decide(
     let elsewhere = asked
         .then(|| elsewhere::elsewhere(bench, &selection))
         .flatten();
-    let verdict = if elsewhere.is_some() && !selection.named.is_empty() {
+    let unlikely = current_off(bench, &selection, true).into_iter().next();
+    let named_elsewhere = elsewhere.is_some() && !selection.named.is_empty();
+    let verdict = if named_elsewhere || unlikely.is_some() {
         Verdict::Ambiguous
     } else {
         verdict
@@ -442,7 +450,7 @@ fn decide(
         doubted,
         beside,
         elsewhere,
-        placed,
+        but: placed.or(unlikely),
         on_white: bench.is_white(),
         vetoed,
     }

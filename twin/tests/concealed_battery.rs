@@ -237,3 +237,35 @@ fn branches_that_could_stand_for_any_relaxation_are_doubted() {
     let said = report.decisions.join("\n");
     assert!(said.contains("follows any process of its kind"), "{said}");
 }
+
+/// A cell whose true current is so much larger than the recorded one.
+fn unseen(load_a: f64, seed: u64) -> Report {
+    let recorded = current_a();
+    let mut noise = noise(seed, NOISE_V);
+    let (mut charge_ah, mut before) = (0.0, recorded[0] + load_a);
+    let value = recorded
+        .iter()
+        .map(|recorded| {
+            let i = recorded + load_a;
+            charge_ah += 0.5 * (i + before) * STEP_S / 3600.0;
+            before = i;
+            open_circuit_v(0.9 - charge_ah / CAPACITY_AH) - RESISTANCE_OHM * i + noise()
+        })
+        .collect();
+    report(recorded, vec![25.0; ROWS], value, Vec::new(), seed, &[])
+}
+
+#[test]
+fn a_consumer_may_be_a_recorded_current_that_is_off() {
+    let report = unseen(0.08, 11);
+    assert_eq!(report.verdict, Verdict::Explained, "{:?}", report.decisions);
+    assert_eq!(report.effects[0].id, "parasitic-load");
+    let said = report.remarks.join("\n");
+    assert!(said.contains("A too low all along"), "{said}");
+    // None that supplies.
+    let report = unseen(-0.08, 12);
+    assert_eq!(report.verdict, Verdict::Ambiguous, "{:?}", report.decisions);
+    assert_eq!(report.effects[0].id, "parasitic-load");
+    let said = &report.summary;
+    assert!(said.contains("A too high all along"), "{said}");
+}

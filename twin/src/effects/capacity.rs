@@ -1,7 +1,7 @@
 //! Capacity is not the rated one.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, counting};
+use super::{Card, Clues, CurrentError, Effect, Parameter, Search, Stage, counting};
 use crate::problem::Problem;
 
 /// See [`CARD`].
@@ -45,5 +45,8 @@ impl Effect for Capacity {
         if let Some(battery) = &mut scene.battery {
             battery.capacity_ah = values[0];
         }
+    }
+    fn in_the_current(&self, values: &[f64], scale: &Scale) -> Option<CurrentError> {
+        Some(CurrentError::Gain(values[0] / scale.capacity_ah))
     }
 }

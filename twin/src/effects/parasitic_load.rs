@@ -1,7 +1,7 @@
 //! A consumer ahead of the sensor.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, counting};
+use super::{Card, Clues, CurrentError, Effect, Parameter, Search, Stage, counting};
 use crate::problem::Problem;
 
 /// Hours in which the largest one empties the battery: a consumer that does so within a day is not overlooked.
@@ -43,5 +43,12 @@ impl Effect for ParasiticLoad {
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         // The cell's whole current: its voltage falls and its charge goes by it.
         scene.signal.iter_mut().for_each(|i| *i += values[0]);
+    }
+    fn in_the_current(&self, values: &[f64], _scale: &Scale) -> Option<CurrentError> {
+        Some(CurrentError::Offset(-values[0]))
+    }
+
+    fn unlikely(&self, values: &[f64]) -> Option<&'static str> {
+        (values[0] < 0.0).then_some("a consumer supplies no current")
     }
 }

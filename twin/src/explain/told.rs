@@ -6,7 +6,7 @@ use super::select::{Selection, percent};
 use super::slope::{BASE_OFF, at_base_end};
 use super::workbench::{Member, Workbench};
 use super::{Nuisance, intervals, locate};
-use crate::effects::find;
+use crate::effects::{CurrentError, find};
 use crate::problem::{Base, Problem};
 use crate::report::data::{
     EffectReport, FittedModel, Location, LocationKind, ParameterReport, Report, SignalPlots,
@@ -185,13 +185,12 @@ pub(super) fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> 
     }
 }
 
-/// The verdict in one sentence; `elsewhere` is what another start would do, `placed` what is to be said against an effect that its place
-/// tells, and `vetoed` is what was taken back for a file that was
-/// never fitted.
+/// The verdict in one sentence; `elsewhere` is what another start would do, `but` what is to be said against an effect that is named,
+/// and `vetoed` what was taken back for a file that was never fitted.
 pub(super) fn sentence(
     bench: &Workbench<'_>,
     selection: &Selection,
-    (verdict, doubted, [elsewhere, placed]): (Verdict, bool, [Option<&str>; 2]),
+    (verdict, doubted, [elsewhere, but]): (Verdict, bool, [Option<&str>; 2]),
     left: Explainable,
     (vetoed, report): (&[&str], &Report),
 ) -> String {
@@ -252,9 +251,9 @@ pub(super) fn sentence(
             "{name}: explained by {} ({figures}), but without any physics as well {elsewhere}: initial_soc may be off.",
             ids.join(" and ")
         ),
-        Verdict::Ambiguous if let Some(placed) = placed => {
+        Verdict::Ambiguous if let Some(but) = but => {
             format!(
-                "{name}: explained by {} ({figures}), but {placed}.",
+                "{name}: explained by {} ({figures}), but {but}.",
                 ids.join(" and ")
             )
         }
@@ -361,6 +360,36 @@ pub(super) fn times_found(
         )
     });
     aligned.into_iter().chain(smooth).collect()
+}
+
+/// What error of a battery's recorded current would look the same as what is named; `unlikely`: only where that can hardly be
+/// what it says.
+pub(super) fn current_off(
+    bench: &Workbench<'_>,
+    selection: &Selection,
+    unlikely: bool,
+) -> Vec<String> {
+    let members = selection
+        .named
+        .iter()
+        .map(|named| &selection.fit.model.members[named.index]);
+    let off = members.filter_map(|member| {
+        let error = match member.effect.in_the_current(&member.values, &bench.scale)? {
+            CurrentError::Offset(by_a) => format!(
+                "{} A too {} all along",
+                short(by_a.abs()),
+                if by_a > 0.0 { "high" } else { "low" }
+            ),
+            CurrentError::Gain(factor) => format!("{factor:.4} times the true one"),
+        };
+        let id = member.id();
+        match member.effect.unlikely(&member.values) {
+            Some(why) => Some(format!("{why}: likelier than {id} is a recorded current that is {error}")),
+            None if unlikely => None,
+            None => Some(format!("the recorded current is taken to be right: one that is {error} would hardly look different from {id}")),
+        }
+    });
+    off.collect()
 }
 
 /// What is written into the extended model file.
