@@ -428,6 +428,11 @@ pub trait Effect: Sync {
         None
     }
 
+    /// How far from its row, before and after, in s, a reading depends on the reference: to a thousandth.
+    fn reach_s(&self, _values: &[f64], _scale: &Scale) -> [f64; 2] {
+        [0.0; 2]
+    }
+
     /// By how much an internal parameter comes round: where in a turn a file begins is no property of the physics.
     fn turn(&self, _values: &[f64]) -> Option<f64> {
         None

@@ -15,6 +15,7 @@ pub mod fit;
 pub mod flexible;
 pub mod held_out;
 pub mod intervals;
+mod lead_in;
 pub mod locate;
 pub mod normal;
 mod quieter;
@@ -40,7 +41,7 @@ use crate::effects::chain::{Chain, Nuisance};
 use crate::effects::{Effect, find_with};
 use crate::problem::Problem;
 use crate::report::data::{Report, SignalReport, Unexplained, Verdict};
-use course::Course;
+use course::{Answer, Course};
 use fit::Fit;
 use flexible::{Explainable, Features};
 use select::Selection;
@@ -55,9 +56,8 @@ use workbench::Workbench;
 
 /// Folds for the figures of held-out blocks, each with a fit of its own.
 const FOLDS: usize = 5;
-/// The reference goes smoothly from row to row if that makes the loss smaller by this (odds of e¹⁰, for no value more); where its
-/// rows alone tell so, unless it makes it larger by this.
-const CLEARLY: f64 = 10.0;
+/// Times that the ends of a recording are left out, and all is decided again: what is named then may reach further.
+const LEAD_INS: usize = 2;
 
 /// How to explain.
 #[derive(Clone, Debug, Default)]
@@ -170,7 +170,7 @@ fn gained(one: &Fit, other: &Fit) -> f64 {
     robust::loss(&one.residual, sigma) - robust::loss(&other.residual, sigma)
 }
 
-/// One signal: decided with the reference in straight lines or as a smooth course, whichever may be better, or both ways.
+/// One signal. Where its ends turn out to depend on what the reference did outside the recording, it is decided again without them.
 fn one(
     problem: &Problem,
     holdouts: &[Holdout],
@@ -178,48 +178,36 @@ fn one(
     report: &mut Report,
     progress: &mut dyn FnMut(f64, &str),
 ) -> Part {
-    let straight = Course {
+    let mut course = Course {
         problem: Cow::Borrowed(problem),
         holdouts: Cow::Borrowed(holdouts),
     };
-    let smooth = straight.smooth();
-    let enough = match &smooth {
-        Some((_, true)) => -CLEARLY,
-        _ => CLEARLY,
-    };
-    // Where the smooth one is clearly nearer to begin with, the straight one would lead to names of what it lacks.
-    let nearer = smooth.as_ref().and_then(|(smooth, _)| {
-        let [from, to] = [&straight, smooth].map(|course| course.nearest(options));
-        (gained(&from?, &to?) > CLEARLY).then_some(smooth)
-    });
-    let mut ahead = None;
-    if let Some(smooth) = nearer {
-        let (decided, shown) = smooth.decided(options, progress);
-        let otherwise = straight.left_by(&decided.selection.fit.model);
-        let names = !decided.names_nothing() && decided.asks_between();
-        if names && gained(&otherwise, &shown) > enough {
-            let between = Some(errors([&otherwise, &shown]));
-            return tell(smooth, (decided, &shown), between, options, report);
-        }
-        ahead = Some((decided, shown));
+    let mut left_out = None;
+    let mut answer = course.answered(options, progress);
+    for _ in 0..LEAD_INS {
+        let Some(reach_s) = answer.reach_s(&course, options) else {
+            break;
+        };
+        course = course.without_ends(reach_s);
+        answer = course.answered(options, progress);
+        left_out = Some(reach_s);
     }
-    let (decided, shown) = straight.decided(options, progress);
-    if decided.asks_between()
-        && let Some((smooth, _)) = smooth.as_ref()
-        && smooth.may_fit(&decided, &shown, enough)
-    {
-        let (again, there) = ahead.unwrap_or_else(|| smooth.decided(options, progress));
-        if gained(&shown, &there) > enough {
-            let between = Some(errors([&shown, &there]));
-            return tell(smooth, (again, &there), between, options, report);
-        }
-    }
-    tell(&straight, (decided, &shown), None, options, report)
-}
-
-/// Root mean squares of what two fits leave.
-fn errors(fits: [&Fit; 2]) -> [f64; 2] {
-    fits.map(|fit| rms(fit.residual.iter().copied()))
+    let Answer {
+        smooth,
+        decided,
+        shown,
+        between,
+    } = answer;
+    let part = tell(
+        smooth.as_ref().unwrap_or(&course),
+        (decided, &shown),
+        between,
+        options,
+        report,
+    );
+    let said = left_out.map(|reach_s| lead_in::told(&problem.name, reach_s));
+    report.remarks.extend(said);
+    part
 }
 
 /// Puts what was decided about a signal into the report; `between`: as `course` in [`times_found`].

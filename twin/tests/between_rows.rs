@@ -6,7 +6,7 @@
 mod common;
 
 use common::{noise, said, sensor};
-use twin::report::data::{ParameterReport, Report};
+use twin::report::data::{ParameterReport, Report, Verdict};
 
 const ROWS: usize = 3000;
 const STEP_S: f64 = 0.1;
@@ -16,8 +16,13 @@ const NOISE_A: f64 = 0.2;
 
 /// Waves of several lengths, in A, on the finer grid.
 fn load() -> Vec<f64> {
+    load_from(0.0)
+}
+
+/// The same from a time in s on.
+fn load_from(begin_s: f64) -> Vec<f64> {
     (0..ROWS * FINE)
-        .map(|k| k as f64 * FINE_S)
+        .map(|k| begin_s + k as f64 * FINE_S)
         .map(|t| {
             50.0 * (t / 3.0).sin()
                 + 40.0 * (1.3 * t).sin()
@@ -120,6 +125,38 @@ fn a_window_and_a_lag_are_as_long_as_they_are() {
         assert_eq!(ids[0], "lag", "{}", report.summary);
         assert_near(found, 0.3, STEP_S * STEP_S / (12.0 * 0.3));
     }
+}
+
+/// A log begins and ends in the middle of a drive: what the reference did outside shows in readings, and no model knows of it.
+#[test]
+fn what_the_reference_did_outside_the_log_speaks_against_no_delay() {
+    for (delay_s, end, seed) in [(0.33, "first", 0), (-0.33, "last", 1)] {
+        let report = of(&load(), &load_from(-delay_s), NOISE_A, seed);
+        let (_, delay) = only(&report);
+        assert_eq!(report.effects[0].id, "delay", "{}", report.summary);
+        assert_ne!(
+            report.verdict,
+            Verdict::PartlyExplained,
+            "{}",
+            report.summary
+        );
+        let [low, high] = delay.ci95;
+        assert!(
+            low <= delay_s && delay_s <= high && high - low < 1e-3,
+            "{delay:?}"
+        );
+        let said = report.remarks.join("\n");
+        assert!(said.contains(&format!("the {end} 0.33")), "{said}");
+    }
+    // Nothing is left out where the log begins at rest.
+    let mut rested = load();
+    rested[..20 * FINE].fill(0.0);
+    let late: Vec<f64> = (0..rested.len())
+        .map(|k| rested[k.saturating_sub(33)])
+        .collect();
+    let report = of(&rested, &late, NOISE_A, 2);
+    let said = report.remarks.join("\n");
+    assert!(!said.contains("not looked at"), "{said}");
 }
 
 /// A lag's equation is an idealisation, but where no more than noise is left it is not off by a gain's size: refused, the gain

@@ -42,6 +42,11 @@ impl Effect for ClockSkew {
         0.0
     }
 
+    fn reach_s(&self, values: &[f64], scale: &Scale) -> [f64; 2] {
+        let lost_s = values[0] * 1e-6 * scale.operation_s;
+        [lost_s.max(0.0), (-lost_s).max(0.0)]
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         scene.skew += values[0] * 1e-6;
     }

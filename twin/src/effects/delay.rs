@@ -44,6 +44,10 @@ impl Effect for Delay {
         within_a_period(values[0], held_s)
     }
 
+    fn reach_s(&self, values: &[f64], _scale: &Scale) -> [f64; 2] {
+        [values[0].max(0.0), (-values[0]).max(0.0)]
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         scene.delay_s += values[0];
     }

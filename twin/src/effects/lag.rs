@@ -38,6 +38,10 @@ impl Effect for Lag {
         within_a_period(values[0], held_s)
     }
 
+    fn reach_s(&self, values: &[f64], _scale: &Scale) -> [f64; 2] {
+        [values[0] * 1000f64.ln(), 0.0]
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         scene.signal = scene.low_pass(&scene.signal, values[0]).into();
     }

@@ -39,6 +39,10 @@ impl Effect for MovingAverage {
         within_a_period(values[0], held_s)
     }
 
+    fn reach_s(&self, values: &[f64], _scale: &Scale) -> [f64; 2] {
+        [values[0], 0.0]
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let held = scene.held();
         scene.signal = scene

@@ -125,6 +125,11 @@ impl Effect for SampledWindow {
         Some(values[0])
     }
 
+    /// A mean is held for a period, and began a window before that.
+    fn reach_s(&self, values: &[f64], _scale: &Scale) -> [f64; 2] {
+        [values[0] * (1.0 + values[1]), 0.0]
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (period, duty, phase) = (values[0], values[1], values[2]);
         if period <= 0.0 {

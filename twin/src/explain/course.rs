@@ -5,14 +5,64 @@ use std::borrow::Cow;
 use super::fit::{self, Fit};
 use super::unfitted::Unfitted;
 use super::workbench::{Member, Model, Workbench};
-use super::{Decided, Holdout, Options, decide, gained};
+use super::{Decided, Holdout, Options, decide, gained, lead_in, rms};
 use crate::effects::Search;
 use crate::problem::Problem;
+
+/// The reference goes smoothly from row to row if that makes the loss smaller by this (odds of e¹⁰, for no value more); where its
+/// rows alone tell so, unless it makes it larger by this.
+const CLEARLY: f64 = 10.0;
 
 /// A signal with the files that were never fitted, as the reference goes from row to row: in straight lines, or smoothly.
 pub(super) struct Course<'a> {
     pub(super) problem: Cow<'a, Problem>,
     pub(super) holdouts: Cow<'a, [Holdout]>,
+}
+
+/// What is decided about a signal, on the course of the reference that it is decided on.
+pub(super) struct Answer {
+    /// The smooth course, if it is that.
+    pub(super) smooth: Option<Course<'static>>,
+    pub(super) decided: Decided,
+    /// What the answer leaves of the readings as they were read.
+    pub(super) shown: Fit,
+    /// The error with straight lines and with a smooth course, if that was taken.
+    pub(super) between: Option<[f64; 2]>,
+}
+
+impl Answer {
+    fn straight((decided, shown): (Decided, Fit)) -> Self {
+        Self {
+            smooth: None,
+            decided,
+            shown,
+            between: None,
+        }
+    }
+
+    fn smooth(smooth: Course<'static>, (decided, shown): (Decided, Fit), straight: &Fit) -> Self {
+        let errors = [straight, &shown].map(|fit| rms(fit.residual.iter().copied()));
+        Self {
+            smooth: Some(smooth),
+            decided,
+            shown,
+            between: Some(errors),
+        }
+    }
+
+    /// How far, in s, readings that the answer cannot foretell reach out of their stretch, before and after, if there are such.
+    pub(super) fn reach_s(&self, straight: &Course<'_>, options: &Options) -> Option<[f64; 2]> {
+        if !self.decided.asks_between() {
+            return None;
+        }
+        let course = self.smooth.as_ref().unwrap_or(straight);
+        let bench = Workbench::new(&course.problem, &options.without);
+        if self.decided.names_nothing() {
+            // Such readings may be why.
+            return lead_in::missed(&bench, &course.nearest(options)?);
+        }
+        lead_in::missed(&bench, &self.shown)
+    }
 }
 
 impl Course<'_> {
@@ -73,6 +123,60 @@ impl Course<'_> {
                 .map(|start| fit::fit(&bench, &start.model, None))
         });
         fits.min_by(|one, other| gained(one, other).total_cmp(&0.0))
+    }
+
+    /// Decided in straight lines or as a smooth course, whichever may be better, or both ways.
+    pub(super) fn answered(
+        &self,
+        options: &Options,
+        progress: &mut dyn FnMut(f64, &str),
+    ) -> Answer {
+        let Some((smooth, told)) = self.smooth() else {
+            return Answer::straight(self.decided(options, progress));
+        };
+        let enough = if told { -CLEARLY } else { CLEARLY };
+        // Where the smooth one is clearly nearer to begin with, the straight one would lead to names of what it lacks.
+        let [from, to] = [self, &smooth].map(|course| course.nearest(options));
+        let nearer = from
+            .zip(to)
+            .is_some_and(|(from, to)| gained(&from, &to) > CLEARLY);
+        let mut ahead = None;
+        if nearer {
+            let (decided, shown) = smooth.decided(options, progress);
+            let otherwise = self.left_by(&decided.selection.fit.model);
+            let names = !decided.names_nothing() && decided.asks_between();
+            if names && gained(&otherwise, &shown) > enough {
+                return Answer::smooth(smooth, (decided, shown), &otherwise);
+            }
+            ahead = Some((decided, shown));
+        }
+        let (decided, shown) = self.decided(options, progress);
+        if decided.asks_between() && smooth.may_fit(&decided, &shown, enough) {
+            let (again, there) = ahead.unwrap_or_else(|| smooth.decided(options, progress));
+            if gained(&shown, &there) > enough {
+                return Answer::smooth(smooth, (again, there), &shown);
+            }
+        }
+        Answer::straight((decided, shown))
+    }
+
+    /// The same without the readings that reach so far, in s, out of their stretch ([`lead_in`]).
+    pub(super) fn without_ends(&self, reach_s: [f64; 2]) -> Course<'static> {
+        let holdout = |holdout: &Holdout| Holdout {
+            file: holdout.file.clone(),
+            problems: holdout
+                .problems
+                .iter()
+                .map(|problem| match problem.name == self.problem.name {
+                    true => lead_in::without(problem, reach_s),
+                    false => problem.clone(),
+                })
+                .collect(),
+        };
+        Course {
+            problem: Cow::Owned(lead_in::without(&self.problem, reach_s)),
+            holdouts: self.holdouts.iter().map(holdout).collect(),
+        }
     }
 
     /// What is decided about it, and what that leaves of the readings.

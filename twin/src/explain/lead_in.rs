@@ -1,0 +1,84 @@
+//! Readings at the ends of a stretch that depend on what the reference did outside it: a log begins in the middle of a drive, and
+//! what comes late has its cause before the log. No model foretells them, so they are not looked at.
+
+use std::ops::Not;
+
+use super::fit::Fit;
+use super::select::CERTAIN;
+use super::told::short;
+use super::workbench::{Model, Workbench};
+use crate::problem::{Observed, Problem};
+
+/// No more than this share of the readings is left out: with more, too little of the recording would be judged.
+const MOST: f64 = 0.1;
+
+/// How far from its row, before and after, in s, a reading depends on the reference.
+fn reach_s(bench: &Workbench<'_>, model: &Model) -> [f64; 2] {
+    model
+        .members
+        .iter()
+        .map(|member| member.effect.reach_s(&member.values, &bench.scale))
+        .fold([0.0; 2], |all, one| [all[0] + one[0], all[1] + one[1]])
+}
+
+/// Rows whose reading reaches out of the stretch of the drive that it belongs to.
+fn reaching_out(problem: &Problem, [before_s, after_s]: [f64; 2]) -> Vec<usize> {
+    let (drive, observed) = (&problem.drive, &problem.observed);
+    let mut reaching = Vec::new();
+    for (segment, rows) in observed.stretches.iter() {
+        let segment = &drive.segments[segment];
+        let Some(last) = segment.end.checked_sub(1) else {
+            continue;
+        };
+        let inside = drive.t_s[segment.start] + before_s..=drive.t_s[last] - after_s;
+        reaching.extend(rows.filter(|&row| inside.contains(&observed.t_s[row]).not()));
+    }
+    reaching
+}
+
+/// How far a model reaches out of the stretches, if readings there are off by more than chance and reference allow.
+pub(super) fn missed(bench: &Workbench<'_>, shown: &Fit) -> Option<[f64; 2]> {
+    let reach = reach_s(bench, &shown.model);
+    if reach == [0.0; 2] {
+        return None;
+    }
+    let problem = bench.problem;
+    let noise = shown.sigma.max(problem.noise).hypot(problem.coloured.rms);
+    let reaching = reaching_out(problem, reach);
+    let off = reaching.iter().any(|row| {
+        bench
+            .rows
+            .binary_search(row)
+            .is_ok_and(|at| shown.residual[at].abs() > CERTAIN * noise + bench.inaccuracy(at))
+    });
+    (off && reaching.len() as f64 <= MOST * bench.len() as f64).then_some(reach)
+}
+
+/// A problem whose readings that reach so far out of their stretch do not count.
+pub(super) fn without(problem: &Problem, reach_s: [f64; 2]) -> Problem {
+    let reaching = reaching_out(problem, reach_s);
+    let mut valid = problem.observed.valid.clone();
+    reaching.into_iter().for_each(|row| valid[row] = false);
+    Problem {
+        observed: Observed {
+            valid,
+            ..problem.observed.clone()
+        },
+        ..problem.clone()
+    }
+}
+
+/// What is said of it.
+pub(super) fn told(name: &str, [before_s, after_s]: [f64; 2]) -> String {
+    let side =
+        |time_s: f64, what: &str| (time_s > 0.0).then(|| format!("the {what} {} s", short(time_s)));
+    let sides: Vec<String> = [side(before_s, "first"), side(after_s, "last")]
+        .into_iter()
+        .flatten()
+        .collect();
+    format!(
+        "{name}: {} of the recording, and of each stretch after a gap, are not looked at: readings there depend on what the reference \
+         did outside, by what is named",
+        sides.join(" and ")
+    )
+}
