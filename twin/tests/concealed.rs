@@ -761,6 +761,41 @@ fn slow_noise_ahead_of_a_rail_stays_below_it() {
     assert_named(&report, "clipping", &[("high_a", 140.0, 0.5)]);
 }
 
+/// Readings show the rail to the digit; gain and offset are what the others say beside it, with one rail or the other.
+#[test]
+fn a_gain_and_an_offset_beside_a_rail() {
+    let rails = [
+        ("high_a", 100.0, f64::NEG_INFINITY, 100.0),
+        ("low_a", -60.0, -60.0, f64::INFINITY),
+    ];
+    for (seed, (end, rail_a, low_a, high_a)) in (4..).zip(rails) {
+        let truth = truth();
+        let mut noise = noise(seed, NOISE_A);
+        let current = truth.current_a.iter();
+        let value = current
+            .map(|i| (0.982 * i + 0.7 + noise()).clamp(low_a, high_a))
+            .collect();
+        let report = explained_as_read(&truth, value, Coloured::default(), seed, &[]);
+        let value_of = |id: &str, name: &str| {
+            let effect = report.effects.iter().find(|effect| effect.id == id);
+            let effect = effect.unwrap_or_else(|| panic!("{id}: {}", report.summary));
+            let found = effect.parameters.iter().find(|p| p.name == name);
+            found.unwrap_or_else(|| panic!("{effect:?}")).value
+        };
+        assert_eq!(value_of("clipping", end), rail_a, "{}", report.summary);
+        assert!(
+            (value_of("gain", "gain") - 0.982).abs() < 1e-3,
+            "{}",
+            report.summary
+        );
+        assert!(
+            (value_of("offset", "offset_a") - 0.7).abs() < 0.05,
+            "{}",
+            report.summary
+        );
+    }
+}
+
 #[test]
 fn the_same_seed_gives_the_same_report() {
     let truth = truth();

@@ -352,9 +352,12 @@ pub(super) fn doubt(
     doubts.extend(placed.map(str::to_owned));
     doubts.extend(quietening(bench, &selection.fit));
     if doubts.is_empty() {
-        // What is left moves the values, however sure the names are.
-        let real = signs.iter().filter(|(_, real, _)| *real);
-        let most = real.map(|(share, ..)| *share).fold(0.0, f64::max);
+        // What is left moves the values, however sure the names are: if it is more than noise is stated to.
+        let most = signs
+            .iter()
+            .filter(|(share, real, _)| *real && share * explained > (STATED - 1.0) * rest)
+            .map(|(share, ..)| *share)
+            .fold(0.0, f64::max);
         return Doubt {
             beside: most * explained,
             ..sure(verdict)

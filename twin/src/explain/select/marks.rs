@@ -42,13 +42,19 @@ pub(super) fn marked(
         if mark.variance < FLOOR * energy {
             continue;
         }
-        let smooth = missed(bench, fit(bench, &base, None));
-        let model = smooth.model.with(Member {
+        let member = Member {
             effect,
             values: mark.values.clone(),
-        });
-        // The other values are those of the smooth simulation: steps have no slope to fit by.
-        let stepped = Fit::of(bench, model, smooth.cost);
+        };
+        let smooth = fit(bench, &base, None);
+        let (smooth, stepped) = if effect.rounds() {
+            // The other values are those of the smooth simulation: steps have no slope to fit by.
+            let smooth = missed(bench, smooth);
+            let stepped = Fit::of(bench, smooth.model.with(member), smooth.cost);
+            (smooth, stepped)
+        } else {
+            (smooth, fit(bench, &base.with(member), None))
+        };
         let members = &stepped.model.members;
         // Where noise goes to and fro over the edges, rounding the simulation adds at most a second rounding error.
         let there = left(&stepped);

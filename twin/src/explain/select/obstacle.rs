@@ -189,7 +189,8 @@ pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
     {
         let (low, high) = member.effect.bounds(p, &bench.scale);
         let value = member.values[p];
-        if value >= member.effect.endless(p, &bench.scale) {
+        // A rail that is not there is at no end.
+        if value >= member.effect.endless(p, &bench.scale) && value != parameter.off {
             return Some(format!(
                 "{} would be {value:.4}, more than the recording tells",
                 parameter.name
@@ -237,7 +238,8 @@ pub(super) fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
         .filter(|other| *other != index)
         .map(|other| {
             let share = members[other].effect.idealised();
-            if share == 0.0 {
+            // What readings show by themselves is as they show it.
+            if share == 0.0 || bench.mark(members[other].effect).is_some() {
                 return 0.0;
             }
             let without = bench.run(&fit.model.without(other));
