@@ -290,6 +290,14 @@ fn within_a_period(time_s: f64, held_s: f64) -> Option<&'static str> {
     (time_s <= WHOLE_ROWS * held_s).then_some(sampled_window::SampledWindow.card().id)
 }
 
+/// A share of a change that is no longer looked for.
+const TRACE: f64 = 1e-3;
+
+/// The reach of readings that stand for a moment so much earlier than their row, or later, if negative ([`Effect::reach_s`]).
+fn reach_of_shift(earlier_s: f64) -> [f64; 2] {
+    [earlier_s.max(0.0), (-earlier_s).max(0.0)]
+}
+
 /// An error of the recorded current that does to a battery what an effect does.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CurrentError {
@@ -428,7 +436,7 @@ pub trait Effect: Sync {
         None
     }
 
-    /// How far from its row, before and after, in s, a reading depends on the reference: to a thousandth.
+    /// How far from its row, before and after, in s, a reading depends on the reference by more than a thousandth.
     fn reach_s(&self, _values: &[f64], _scale: &Scale) -> [f64; 2] {
         [0.0; 2]
     }

@@ -290,10 +290,10 @@ fn tell(
     report
         .remarks
         .extend(times_found(&read, &selection.fit, between));
-    let off = current_off(bench, &selection, false).into_iter();
+    let off = current_off(bench, &selection).into_iter();
     report
         .remarks
-        .extend(off.map(|off| format!("{}: {off}", problem.name)));
+        .extend(off.map(|(off, _)| format!("{}: {off}", problem.name)));
     if verdict != Verdict::Unknown {
         report.remarks.extend(slips(&read, shown, verdict));
     }
@@ -423,7 +423,9 @@ fn decide(
     let elsewhere = asked
         .then(|| elsewhere::elsewhere(bench, &selection))
         .flatten();
-    let unlikely = current_off(bench, &selection, true).into_iter().next();
+    let unlikely = current_off(bench, &selection)
+        .into_iter()
+        .find_map(|(off, likelier)| likelier.then_some(off));
     let named_elsewhere = elsewhere.is_some() && !selection.named.is_empty();
     let verdict = if named_elsewhere || unlikely.is_some() {
         Verdict::Ambiguous

@@ -41,12 +41,13 @@ impl Effect for Capacity {
             .to_vec()
     }
 
+    fn in_the_current(&self, values: &[f64], scale: &Scale) -> Option<CurrentError> {
+        Some(CurrentError::Gain(values[0] / scale.capacity_ah))
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         if let Some(battery) = &mut scene.battery {
             battery.capacity_ah = values[0];
         }
-    }
-    fn in_the_current(&self, values: &[f64], scale: &Scale) -> Option<CurrentError> {
-        Some(CurrentError::Gain(values[0] / scale.capacity_ah))
     }
 }

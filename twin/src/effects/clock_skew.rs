@@ -1,7 +1,7 @@
 //! Two clocks of different rate.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, reach_of_shift, spaced};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -43,8 +43,7 @@ impl Effect for ClockSkew {
     }
 
     fn reach_s(&self, values: &[f64], scale: &Scale) -> [f64; 2] {
-        let lost_s = values[0] * 1e-6 * scale.operation_s;
-        [lost_s.max(0.0), (-lost_s).max(0.0)]
+        reach_of_shift(values[0] * 1e-6 * scale.operation_s)
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

@@ -1,7 +1,9 @@
 //! Transport delay.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced, within_a_period};
+use super::{
+    Card, Clues, Effect, Parameter, Search, Stage, reach_of_shift, spaced, within_a_period,
+};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -45,7 +47,7 @@ impl Effect for Delay {
     }
 
     fn reach_s(&self, values: &[f64], _scale: &Scale) -> [f64; 2] {
-        [values[0].max(0.0), (-values[0]).max(0.0)]
+        reach_of_shift(values[0])
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

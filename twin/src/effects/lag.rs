@@ -1,7 +1,7 @@
 //! First-order low-pass.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced, within_a_period};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, TRACE, spaced, within_a_period};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -39,7 +39,7 @@ impl Effect for Lag {
     }
 
     fn reach_s(&self, values: &[f64], _scale: &Scale) -> [f64; 2] {
-        [values[0] * 1000f64.ln(), 0.0]
+        [-values[0] * TRACE.ln(), 0.0]
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

@@ -40,15 +40,16 @@ impl Effect for ParasiticLoad {
         vec![vec![1e-3 * scale.capacity_ah.max(0.1)]]
     }
 
-    fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
-        // The cell's whole current: its voltage falls and its charge goes by it.
-        scene.signal.iter_mut().for_each(|i| *i += values[0]);
-    }
     fn in_the_current(&self, values: &[f64], _scale: &Scale) -> Option<CurrentError> {
         Some(CurrentError::Offset(-values[0]))
     }
 
     fn unlikely(&self, values: &[f64]) -> Option<&'static str> {
         (values[0] < 0.0).then_some("a consumer supplies no current")
+    }
+
+    fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
+        // The cell's whole current: its voltage falls and its charge goes by it.
+        scene.signal.iter_mut().for_each(|i| *i += values[0]);
     }
 }

@@ -69,19 +69,19 @@ impl Course<'_> {
     /// The smooth one, if there may be one, and whether the rows alone tell that it is.
     pub(super) fn smooth(&self) -> Option<(Course<'static>, bool)> {
         let (problem, told) = self.problem.smoothed()?;
-        let smooth = |holdout: &Holdout| Holdout {
+        Some((self.with(problem, Problem::with_smooth_reference), told))
+    }
+
+    /// Another form of the problem, and the same of the files that were never fitted.
+    fn with(&self, problem: Problem, form: impl Fn(&Problem) -> Problem) -> Course<'static> {
+        let holdout = |holdout: &Holdout| Holdout {
             file: holdout.file.clone(),
-            problems: holdout
-                .problems
-                .iter()
-                .map(Problem::with_smooth_reference)
-                .collect(),
+            problems: holdout.problems.iter().map(&form).collect(),
         };
-        let smooth = Course {
-            holdouts: self.holdouts.iter().map(smooth).collect(),
+        Course {
             problem: Cow::Owned(problem),
-        };
-        Some((smooth, told))
+            holdouts: self.holdouts.iter().map(holdout).collect(),
+        }
     }
 
     /// Whether what was named on another course, fitted here, makes the loss smaller by so much: if not, to decide again is in vain.
@@ -162,21 +162,14 @@ impl Course<'_> {
 
     /// The same without the readings that reach so far, in s, out of their stretch ([`lead_in`]).
     pub(super) fn without_ends(&self, reach_s: [f64; 2]) -> Course<'static> {
-        let holdout = |holdout: &Holdout| Holdout {
-            file: holdout.file.clone(),
-            problems: holdout
-                .problems
-                .iter()
-                .map(|problem| match problem.name == self.problem.name {
-                    true => lead_in::without(problem, reach_s),
-                    false => problem.clone(),
-                })
-                .collect(),
-        };
-        Course {
-            problem: Cow::Owned(lead_in::without(&self.problem, reach_s)),
-            holdouts: self.holdouts.iter().map(holdout).collect(),
-        }
+        let without = |problem: &Problem| lead_in::without(problem, reach_s);
+        self.with(without(&self.problem), |other| {
+            if other.name == self.problem.name {
+                without(other)
+            } else {
+                other.clone()
+            }
+        })
     }
 
     /// What is decided about it, and what that leaves of the readings.

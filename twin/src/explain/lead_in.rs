@@ -1,8 +1,6 @@
 //! Readings at the ends of a stretch that depend on what the reference did outside it: a log begins in the middle of a drive, and
 //! what comes late has its cause before the log. No model foretells them, so they are not looked at.
 
-use std::ops::Not;
-
 use super::fit::Fit;
 use super::select::CERTAIN;
 use super::told::short;
@@ -31,7 +29,7 @@ fn reaching_out(problem: &Problem, [before_s, after_s]: [f64; 2]) -> Vec<usize> 
             continue;
         };
         let inside = drive.t_s[segment.start] + before_s..=drive.t_s[last] - after_s;
-        reaching.extend(rows.filter(|&row| inside.contains(&observed.t_s[row]).not()));
+        reaching.extend(rows.filter(|&row| !inside.contains(&observed.t_s[row])));
     }
     reaching
 }

@@ -129,7 +129,7 @@ pub(super) fn slipped(bench: &Workbench<'_>, plain: &Fit, fit: &Fit) -> Vec<usiz
 }
 
 /// Whether the noise of readings is what the model file states: behind what cuts or rounds it is not.
-fn noise_is_stated(bench: &Workbench<'_>, fit: &Fit) -> bool {
+pub(super) fn noise_is_stated(bench: &Workbench<'_>, fit: &Fit) -> bool {
     let cuts = |member: &Member| member.effect.cuts();
     bench.problem.noise > 0.0 && !fit.model.members.iter().any(cuts)
 }

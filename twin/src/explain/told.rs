@@ -362,19 +362,12 @@ pub(super) fn times_found(
     aligned.into_iter().chain(smooth).collect()
 }
 
-/// What error of a battery's recorded current would look the same as what is named; `unlikely`: only where that can hardly be
-/// what it says.
-pub(super) fn current_off(
-    bench: &Workbench<'_>,
-    selection: &Selection,
-    unlikely: bool,
-) -> Vec<String> {
-    let members = selection
-        .named
-        .iter()
-        .map(|named| &selection.fit.model.members[named.index]);
-    let off = members.filter_map(|member| {
-        let error = match member.effect.in_the_current(&member.values, &bench.scale)? {
+/// What error of a battery's recorded current would look the same as a named effect, and whether that is likelier than the effect.
+pub(super) fn current_off(bench: &Workbench<'_>, selection: &Selection) -> Vec<(String, bool)> {
+    let members = &selection.fit.model.members;
+    let off = selection.named.iter().filter_map(|named| {
+        let Member { effect, values } = &members[named.index];
+        let error = match effect.in_the_current(values, &bench.scale)? {
             CurrentError::Offset(by_a) => format!(
                 "{} A too {} all along",
                 short(by_a.abs()),
@@ -382,12 +375,19 @@ pub(super) fn current_off(
             ),
             CurrentError::Gain(factor) => format!("{factor:.4} times the true one"),
         };
-        let id = member.id();
-        match member.effect.unlikely(&member.values) {
-            Some(why) => Some(format!("{why}: likelier than {id} is a recorded current that is {error}")),
-            None if unlikely => None,
-            None => Some(format!("the recorded current is taken to be right: one that is {error} would hardly look different from {id}")),
-        }
+        let id = effect.card().id;
+        Some(match effect.unlikely(values) {
+            Some(why) => (
+                format!("{why}: likelier than {id} is a recorded current that is {error}"),
+                true,
+            ),
+            None => (
+                format!(
+                    "the recorded current is taken to be right: one that is {error} would hardly look different from {id}"
+                ),
+                false,
+            ),
+        })
     });
     off.collect()
 }

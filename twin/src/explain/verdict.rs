@@ -7,7 +7,7 @@ use super::quieter::only_quietens;
 use super::robust::{common, spread};
 use super::select::{self, Selection, percent};
 use super::slope::change;
-use super::strays::{STRAY, slipped, strays};
+use super::strays::{STRAY, noise_is_stated, slipped, strays};
 use super::told::short;
 use super::workbench::{Member, Model, Workbench};
 use super::{Held, intervals, jumps, rms};
@@ -434,8 +434,7 @@ fn beyond(bench: &Workbench<'_>, rest: f64, unavoidable: f64) -> f64 {
 fn remembered(bench: &Workbench<'_>, fit: &Fit, slips: &[usize]) -> f64 {
     let noise = bench.problem.noise;
     // Behind what cuts or rounds, noise is not what the model file states; and a memory that it states hides another.
-    let cuts = |member: &Member| member.effect.cuts();
-    if noise <= 0.0 || bench.coloured().rms > 0.0 || fit.model.members.iter().any(cuts) {
+    if bench.coloured().rms > 0.0 || !noise_is_stated(bench, fit) {
         return 0.0;
     }
     let accuracy = Accuracy {

@@ -7,6 +7,7 @@ use crate::explain::normal::dot;
 use crate::explain::robust::huber;
 use crate::explain::shape::without_memory;
 use crate::explain::slope::change;
+use crate::explain::strays::noise_is_stated;
 use crate::explain::told::short;
 use crate::explain::verdict::{STATED, allowed};
 use crate::explain::workbench::{Member, Model, Workbench};
@@ -246,18 +247,20 @@ pub(super) fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
             share * share * apart(bench, &fit.predicted, &without)
         })
         .sum();
-    (bench.modelled + others).min(shown(bench, fit))
+    let idealised = bench.modelled + others;
+    if idealised == 0.0 {
+        return 0.0;
+    }
+    idealised.min(left_along(bench, fit))
 }
 
 /// The most energy by which equations may be off along one effect, for what is left shows none of it: a wrong equation is not off along
 /// that effect alone. Without a bound where no noise is stated, or where more than white noise as it is stated comes through.
-fn shown(bench: &Workbench<'_>, fit: &Fit) -> f64 {
-    let stated = bench.problem.noise;
-    let cuts = |member: &Member| member.effect.cuts();
-    if stated <= 0.0 || bench.problem.coloured.rms > 0.0 || fit.model.members.iter().any(cuts) {
+fn left_along(bench: &Workbench<'_>, fit: &Fit) -> f64 {
+    if bench.problem.coloured.rms > 0.0 || !noise_is_stated(bench, fit) {
         return f64::INFINITY;
     }
-    let allowed = allowed(bench, stated * stated * bench.len() as f64);
+    let allowed = allowed(bench, bench.problem.noise.powi(2) * bench.len() as f64);
     let left = dot(&fit.residual, &fit.residual) - allowed;
     ALONG * left.max((STATED - 1.0) * allowed)
 }
