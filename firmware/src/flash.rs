@@ -1,17 +1,13 @@
 //! W25Q32 on SPI2 as an asynchronous NOR flash. A page program takes up to 3 ms and a sector erase up to 400 ms; the
 //! chip is asked once a millisecond meanwhile, so neither blocks anybody.
 
-use core::{future::poll_fn, task::Poll};
-
 use embedded_hal::spi::{Operation, SpiDevice};
 use embedded_storage_async::nor_flash::{
     ErrorType, MultiwriteNorFlash, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
 };
-use rtic_monotonics::systick::prelude::*;
-
 use core_logic::check_in::Task;
 
-use crate::{Mono, app};
+use crate::{app, pace::pause};
 
 /// 32 Mbit.
 pub const CAPACITY: usize = 4 * 1024 * 1024;
@@ -77,20 +73,6 @@ fn command(code: u8, address: u32) -> [u8; 4] {
     [code, high, middle, low]
 }
 
-/// Lets the other tasks and interrupts of the same priority run.
-pub async fn yield_now() {
-    let mut yielded = false;
-    poll_fn(|context| {
-        if yielded {
-            return Poll::Ready(());
-        }
-        yielded = true;
-        context.waker().wake_by_ref();
-        Poll::Pending
-    })
-    .await;
-}
-
 impl<SPI: SpiDevice> Flash<SPI> {
     /// Takes the chip without a transfer.
     pub fn new(spi: SPI) -> Self {
@@ -101,8 +83,8 @@ impl<SPI: SpiDevice> Flash<SPI> {
     /// runs that a reset of the MCU cut off from us.
     pub async fn start(&mut self) -> Result<(), Error<SPI::Error>> {
         self.0.write(&[RELEASE_POWER_DOWN]).map_err(Error::Bus)?;
-        // 3 µs until it listens.
-        Mono::delay(1.millis()).await;
+        // 3 µs until it listens; the next millisecond may begin sooner.
+        pause(2).await;
         if self.status()? & STATUS_BUSY != 0 {
             return Err(Error::Timeout);
         }
@@ -133,8 +115,7 @@ impl<SPI: SpiDevice> Flash<SPI> {
                 return Ok(());
             }
             app::alive(Task::Storage);
-            // The next tick: a delay lasts one longer than it is asked for.
-            Mono::delay_until(Mono::now() + 1.millis()).await;
+            pause(1).await;
         }
         Err(Error::Timeout)
     }
@@ -179,7 +160,7 @@ impl<SPI: SpiDevice> ReadNorFlash for Flash<SPI> {
     async fn read(&mut self, offset: u32, bytes: &mut [u8]) -> Result<(), Self::Error> {
         let offset = within(offset, bytes.len()).ok_or(Error::OutOfBounds)?;
         self.transfer(&command(READ, offset), bytes)?;
-        yield_now().await;
+        pause(0).await;
         Ok(())
     }
 

@@ -22,6 +22,7 @@ mod i2c;
 mod identity;
 mod inputs;
 mod meter;
+mod pace;
 mod retain;
 mod rs485;
 mod spi;
@@ -41,7 +42,11 @@ defmt::timestamp!("{=u64:us}", time::now().as_ticks());
     dispatchers = [UART4, UART5, USART6]
 )]
 mod app {
-    use core::sync::atomic::{AtomicU32, Ordering};
+    use core::{
+        convert::Infallible,
+        pin::pin,
+        sync::atomic::{AtomicU32, Ordering},
+    };
 
     use core_logic::{
         check_in::{CheckIn, Task},
@@ -74,6 +79,7 @@ mod app {
         identity,
         inputs::Lines,
         meter::{self, Meter, event},
+        pace,
         retain::{self, Previous, Stage},
         rs485::{Character, Port, QUEUE_LENGTH},
         stack,
@@ -96,7 +102,7 @@ mod app {
     }
 
     /// The next time at which the milliseconds since the start divided by [`TICK_MS`] leave `phase_ms`.
-    fn next_on_grid(phase_ms: u32) -> fugit::MonotonicTimerInstantU32<1_000> {
+    fn next_on_grid(phase_ms: u32) -> pace::Millisecond {
         let now = Mono::now();
         let into = now.duration_since_epoch().as_millis() % TICK_MS;
         now + ((phase_ms + TICK_MS - into - 1) % TICK_MS + 1).millis()
@@ -351,18 +357,18 @@ mod app {
         let mut next_poll = next_on_grid(METER_PHASE_MS);
         if meter.is_fresh() {
             cx.shared.meter_link.lock(|link| link.in_self_test = true);
-            Mono::delay_until(next_poll).await;
+            pace::until(next_poll).await;
             if let Some(start) = meter.start_self_test() {
                 for _ in 0..meter::SELF_TEST_MS / TICK_MS {
                     next_poll += TICK_MS.millis();
-                    Mono::delay_until(next_poll).await;
+                    pace::until(next_poll).await;
                     alive(Task::Meter);
                 }
                 meter.finish_self_test(start);
             }
         }
         cx.shared.meter_link.lock(|link| link.in_self_test = false);
-        Mono::delay_until(next_poll).await;
+        pace::until(next_poll).await;
         let mut polls = 0_u32;
         let mut next_temperature = 0;
         let (mut edge, mut interrupt, mut verify, mut poll) = (false, false, true, true);
@@ -445,7 +451,7 @@ mod app {
             }
             if worked {
                 // The other interrupts of this priority have their turn between two steps.
-                crate::flash::yield_now().await;
+                pace::yield_now().await;
                 continue;
             }
 
@@ -457,7 +463,7 @@ mod app {
                 next_poll
             };
             // A time-out is one of the two expected outcomes.
-            let _ = Mono::timeout_at(until, wake.wait()).await;
+            let _ = pace::until_event(until, wake.wait()).await;
             let now = time::now();
             let (found, irq, storms) = (
                 &mut cx.shared.edges,
@@ -514,7 +520,7 @@ mod app {
                 )
             });
             if channel != Channel::Ads1100 {
-                Mono::delay(TICK_MS.millis()).await;
+                pace::at_least(TICK_MS).await;
                 continue;
             }
             let started = time::now();
@@ -546,7 +552,7 @@ mod app {
             });
             if failed {
                 // A bus that fails at once must not take the time of those that work.
-                Mono::delay(TICK_MS.millis()).await;
+                pace::at_least(TICK_MS).await;
             }
         }
     }
@@ -558,12 +564,11 @@ mod app {
         pace: &mut PollPace,
     ) -> Result<Option<i16>, ConverterFault> {
         let first_ms = pace.first_ms(config.data_rate);
-        Mono::delay(first_ms.millis()).await;
+        pace::at_least(first_ms).await;
         for waited_ms in first_ms..=PollPace::limit_ms(config.data_rate) {
             let code = match converter.poll(config)? {
                 Progress::Busy => {
-                    // The next tick: a delay lasts one longer than it is asked for.
-                    Mono::delay_until(Mono::now() + 1.millis()).await;
+                    pace::until(Mono::now() + 1.millis()).await;
                     continue;
                 }
                 Progress::Discarded => None,
@@ -582,7 +587,7 @@ mod app {
     async fn tick(mut cx: tick::Context) {
         let mut next = next_on_grid(0);
         loop {
-            Mono::delay_until(next).await;
+            pace::until(next).await;
             next += TICK_MS.millis();
             alive(Task::Tick);
             time::extend();
@@ -662,7 +667,7 @@ mod app {
             let wait_ms = server
                 .ends_at()
                 .map_or(100, |end| until_ms(end, time::now()).clamp(1, 100));
-            let _ = Mono::timeout_after(wait_ms.millis(), wake.wait()).await;
+            let _ = pace::until_event(Mono::now() + (wait_ms + 1).millis(), wake.wait()).await;
             while let Some(character) = cx.local.characters_out.dequeue() {
                 let (byte, line_errors, at) = character.unpack();
                 server.on_character(byte, line_errors, at);
@@ -694,7 +699,7 @@ mod app {
                         );
                     }
                     if let Some((reply, earliest)) = served.reply {
-                        Mono::delay(until_ms(earliest, time::now()).millis()).await;
+                        pace::at_least(until_ms(earliest, time::now())).await;
                         cx.shared.port.lock(|port| port.send(reply));
                     }
                 }
@@ -854,20 +859,24 @@ mod app {
     /// Reads the flash, starts the measurement, and then keeps configuration, charge and log. No deadline; a loss of
     /// power costs at most what the save policy states.
     #[task(priority = 1, local = [storage, previous], shared = [center, administration, meter_link])]
-    async fn storage(mut cx: storage::Context) {
+    async fn storage(cx: storage::Context) {
+        pace::paced(pin!(store(cx))).await;
+    }
+
+    async fn store(mut cx: storage::Context<'_>) -> Infallible {
         let storage = cx.local.storage;
         let (mut stored, mut state) = (Stored::Refused, Stored::Refused);
         let load = async {
             // A chip that answers late or wrongly once, or still erases, must not cost the calibration.
             while !storage.start().await {
                 alive(Task::Storage);
-                Mono::delay(1.millis()).await;
+                pace::pause(2).await;
             }
             stored = storage.configuration().await;
             state = storage.state().await;
         };
         // What has not come in time counts as refused.
-        let _ = Mono::timeout_after(LOAD_LIMIT_MS.millis(), load).await;
+        pace::limited(LOAD_LIMIT_MS, pin!(load)).await;
         if !storage.is_ready() {
             defmt::error!("flash not ready");
         }
@@ -927,7 +936,8 @@ mod app {
         let mut clearing = false;
         loop {
             let turn_ms = if clearing { 10 } else { 100 };
-            Mono::delay(turn_ms.millis()).await;
+            // At least that long: the first millisecond is no whole one.
+            pace::pause(turn_ms + 1).await;
             alive(Task::Storage);
             since_log_ms += turn_ms;
             since_start_ms += turn_ms;

@@ -1,0 +1,102 @@
+//! How the storage task waits: what works on the flash only says for how long, and the task keeps the one timer.
+//!
+//! A timer of the queue has to be dropped with whatever holds it. In the flash it would lie beneath some thirty futures of
+//! sequential-storage and of `storage`, each with code to drop it: 1.4 KB.
+
+use core::{
+    convert::Infallible,
+    future::{Future, poll_fn},
+    pin::Pin,
+    sync::atomic::{AtomicU32, Ordering},
+    task::Poll,
+};
+
+use rtic_monotonics::{
+    Timebase,
+    rtic_time::timer_queue::{Delay, Timeout, TimerQueue, TimerQueueBackend as _},
+    systick::{SystickBackend, prelude::*},
+};
+
+use crate::Mono;
+
+/// A time of the timer queue.
+pub type Millisecond = <Mono as Timebase>::Instant;
+
+/// What [`paced`] waits before it goes on, in milliseconds.
+static PAUSE_MS: AtomicU32 = AtomicU32::new(0);
+
+/// Lets the other tasks and interrupts of the same priority run.
+pub fn yield_now() -> impl Future<Output = ()> {
+    let mut yielded = false;
+    poll_fn(move |context| {
+        if core::mem::replace(&mut yielded, true) {
+            return Poll::Ready(());
+        }
+        context.waker().wake_by_ref();
+        Poll::Pending
+    })
+}
+
+fn queue() -> &'static TimerQueue<SystickBackend> {
+    SystickBackend::timer_queue()
+}
+
+/// Until `instant`. Not `Mono::delay_until`, an async function around the same future.
+pub fn until(instant: Millisecond) -> Delay<'static, SystickBackend> {
+    queue().delay_until(instant.as_ticks())
+}
+
+/// Until at least `ms` milliseconds have passed, of which the first is no whole one.
+pub fn at_least(ms: u32) -> Delay<'static, SystickBackend> {
+    until(Mono::now() + (ms + 1).millis())
+}
+
+/// Until `event` or `instant`, whichever comes first.
+pub fn until_event<F: Future>(
+    instant: Millisecond,
+    event: F,
+) -> Timeout<'static, SystickBackend, F> {
+    queue().timeout_at(instant.as_ticks(), event)
+}
+
+/// Within [`paced`] alone: the time until the `ms`-th next millisecond begins; with 0 as [`yield_now`].
+pub fn pause(ms: u32) -> impl Future<Output = ()> {
+    let mut said = false;
+    poll_fn(move |_| {
+        if core::mem::replace(&mut said, true) {
+            return Poll::Ready(());
+        }
+        PAUSE_MS.store(ms, Ordering::Relaxed);
+        Poll::Pending
+    })
+}
+
+/// Does `work`, which waits by [`pause`] alone. Pinned by the caller, as below: taken by value it would be held twice.
+pub async fn paced(mut work: Pin<&mut impl Future<Output = Infallible>>) {
+    loop {
+        poll_fn(|context| {
+            let _ = work.as_mut().poll(context);
+            Poll::Ready(())
+        })
+        .await;
+        match PAUSE_MS.load(Ordering::Relaxed) {
+            0 => yield_now().await,
+            ms => until(Mono::now() + ms.millis()).await,
+        }
+    }
+}
+
+/// Within [`paced`]: `work`, unless it has not ended `limit_ms` from now.
+pub fn limited(
+    limit_ms: u32,
+    mut work: Pin<&mut impl Future<Output = ()>>,
+) -> impl Future<Output = ()> {
+    let end = Mono::now() + limit_ms.millis();
+    poll_fn(move |context| {
+        if work.as_mut().poll(context).is_ready() || Mono::now() >= end {
+            Poll::Ready(())
+        } else {
+            Poll::Pending
+        }
+    })
+}
