@@ -350,7 +350,7 @@ fn answer<const N: usize>(
             put(reply, &[*function, bytes])?;
             if *function == 0x04 {
                 read(INPUTS, address, quantity, reply, |row, element| {
-                    (row.get)(readings, element)
+                    row.get(readings, element)
                 })?;
             } else if address == COMMAND_ADDRESS {
                 if quantity != 1 {
@@ -661,14 +661,14 @@ mod tests {
             let got = board.read(4, row.layout.address, words).unwrap();
             let mut expected = Bytes::new();
             for element in 0..usize::from(row.layout.count) {
-                let value = (row.get)(&board.readings, element);
+                let value = row.get(&board.readings, element);
                 expected
                     .extend((0..row.layout.kind.width()).map(|w| row.layout.kind.word(value, w)));
             }
             assert_eq!(got, expected);
             // An index that no request can make reads nothing.
             if row.layout.count > 1 {
-                assert_eq!((row.get)(&board.readings, usize::from(row.layout.count)), 0);
+                assert_eq!(row.get(&board.readings, usize::from(row.layout.count)), 0);
             }
         }
     }
@@ -684,7 +684,7 @@ mod tests {
                         .iter()
                         .filter(|row| {
                             (0..usize::from(row.layout.count))
-                                .any(|i| (row.get)(&set, i) != (row.get)(&Readings::default(), i))
+                                .any(|i| row.get(&set, i) != row.get(&Readings::default(), i))
                         })
                         .map(|row| row.layout.address)
                         .collect();

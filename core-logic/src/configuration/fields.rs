@@ -42,9 +42,6 @@ pub struct Field {
     /// Smallest and largest value; in millions for a value of 64 bits, so that a row keeps half the flash.
     min: i32,
     max: i32,
-    /// Where an element is kept; one function for reading and writing, as there is one for every row. `None` when it
-    /// belongs to another front end than the one set.
-    place: fn(&mut Configuration, usize) -> Option<&mut dyn Setting>,
 }
 
 impl Row for Field {
@@ -70,7 +67,7 @@ impl Field {
 
     /// As [`Field::get`], from a configuration that the caller may change; it is not changed.
     pub(crate) fn get_in(&self, configuration: &mut Configuration, element: usize) -> Option<i64> {
-        (self.place)(configuration, element).map(|setting| setting.read())
+        place(self.layout.address, configuration, element).map(|setting| setting.read())
     }
 
     /// Smallest and largest value.
@@ -109,7 +106,9 @@ impl Field {
         value: i64,
     ) -> Result<(), Violation> {
         self.check(element, value)?;
-        if (self.place)(configuration, element).is_some_and(|setting| setting.write(value)) {
+        if place(self.layout.address, configuration, element)
+            .is_some_and(|setting| setting.write(value))
+        {
             configuration.derive();
             Ok(())
         } else {
@@ -282,17 +281,19 @@ fn of_range_mut<T>(values: &mut PerRange<T>, element: usize) -> Option<&mut T> {
 
 /// Where a setting is kept, after how it is reached.
 macro_rules! place {
-    ([at $($path:ident).+]) => { |c, _| Some(&mut c.$($path).+) };
-    ([ranges $($path:ident).+]) => { |c, i| Some(of_range_mut(&mut c.$($path).+, i)?) };
-    ([each $($path:ident).+ ; $member:ident]) => { |c, i| Some(&mut c.$($path).+.get_mut(i)?.$member) };
-    ([list $($path:ident).+]) => { |c, i| Some(c.$($path).+.get_mut(i)?) };
-    ([sensor $variant:ident $($path:ident).+]) => { |c, _| match &mut c.front_end {
-        FrontEnd::$variant(sensor) => Some(&mut sensor.$($path).+),
-        _ => None,
+    ($c:ident $i:ident [at $($path:ident).+]) => { &mut $c.$($path).+ };
+    ($c:ident $i:ident [ranges $($path:ident).+]) => { of_range_mut(&mut $c.$($path).+, $i)? };
+    ($c:ident $i:ident [each $($path:ident).+ ; $member:ident]) => {
+        &mut $c.$($path).+.get_mut($i)?.$member
+    };
+    ($c:ident $i:ident [list $($path:ident).+]) => { $c.$($path).+.get_mut($i)? };
+    ($c:ident $i:ident [sensor $variant:ident $($path:ident).+]) => { match &mut $c.front_end {
+        FrontEnd::$variant(sensor) => &mut sensor.$($path).+,
+        _ => return None,
     } };
-    ([sensor_ranges $variant:ident $($path:ident).+]) => { |c, i| match &mut c.front_end {
-        FrontEnd::$variant(sensor) => Some(of_range_mut(&mut sensor.$($path).+, i)?),
-        _ => None,
+    ($c:ident $i:ident [sensor_ranges $variant:ident $($path:ident).+]) => { match &mut $c.front_end {
+        FrontEnd::$variant(sensor) => of_range_mut(&mut sensor.$($path).+, $i)?,
+        _ => return None,
     } };
 }
 
@@ -321,9 +322,17 @@ macro_rules! fields {
                 when: When::$when,
                 min: limit(Kind::$kind, $min as i64),
                 max: limit(Kind::$kind, $max as i64),
-                place: place!($access),
             },)*
         ];
+        /// Where an element of the row at `address` is kept; `None` when it belongs to another front end than the one
+        /// set. One function for reading and writing, and for all rows: a function for each takes twice the flash.
+        #[inline(never)]
+        fn place(address: u16, configuration: &mut Configuration, element: usize) -> Option<&mut dyn Setting> {
+            Some(match address {
+                $($address => place!(configuration element $access),)*
+                _ => return None,
+            })
+        }
         /// What [`FIELDS`] mean, row by row.
         pub static FIELD_TEXTS: &[Text] = &[
             $(Text { name: $name, unit: $unit, meaning: $meaning },)*

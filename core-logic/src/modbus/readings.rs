@@ -207,8 +207,14 @@ impl Readings {
 pub struct Input {
     /// Where it lies.
     pub layout: Layout,
+}
+
+impl Input {
     /// The value of one of its elements.
-    pub get: fn(&Readings, usize) -> i64,
+    #[must_use]
+    pub fn get(&self, readings: &Readings, element: usize) -> i64 {
+        value(self.layout.address, readings, element)
+    }
 }
 
 impl Row for Input {
@@ -235,9 +241,16 @@ macro_rules! inputs {
         pub static INPUTS: &[Input] = &[
             $(Input {
                 layout: Layout { address: $address, kind: Kind::$kind, count: $count },
-                get: |$r, $i| $value,
             },)*
         ];
+        /// The value of an element of the row at `address`. One function for all rows: a function for each takes more flash.
+        #[inline(never)]
+        fn value(address: u16, readings: &Readings, element: usize) -> i64 {
+            match (address, readings, element) {
+                $(($address, $r, $i) => $value,)*
+                _ => 0,
+            }
+        }
         /// What [`INPUTS`] mean, row by row.
         pub static INPUT_TEXTS: &[Text] = &[
             $(Text { name: $name, unit: $unit, meaning: $meaning },)*
