@@ -1,11 +1,11 @@
 //! W25Q32 on SPI2 as an asynchronous NOR flash. A page program takes up to 3 ms and a sector erase up to 400 ms; the
 //! chip is asked once a millisecond meanwhile, so neither blocks anybody.
 
+use core_logic::check_in::Task;
 use embedded_hal::spi::{Operation, SpiDevice};
 use embedded_storage_async::nor_flash::{
     ErrorType, MultiwriteNorFlash, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
 };
-use core_logic::check_in::Task;
 
 use crate::{app, pace::pause};
 

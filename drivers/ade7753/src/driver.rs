@@ -2,6 +2,7 @@
 
 use core::slice;
 
+use both_flavours::both_flavours;
 use embedded_hal::spi::Operation;
 
 use crate::config::Config;
@@ -11,7 +12,9 @@ use crate::registers::{
     Mode, NonDestructive, Register, RegisterId, Rststatus, Status, Temp, Waveform, Width, Writable,
 };
 use crate::timing::Timing;
-use crate::transport::Transport;
+#[cfg(feature = "async")]
+use crate::transport::Asynchronous;
+use crate::transport::Blocking;
 
 /// Bit 7 of the communications register: the transfer that follows is a write.
 const WRITE: u8 = 0x80;
@@ -211,8 +214,9 @@ fn count(counter: &mut u32) {
     *counter = counter.saturating_add(1);
 }
 
-impl<T: Transport> Core<T> {
-    fn bus_error(&mut self, register: RegisterId, source: T::Error) -> Error<T::Error> {
+#[both_flavours]
+impl<SPI: embedded_hal_async::spi::SpiDevice> Core<Asynchronous<SPI>> {
+    fn bus_error(&mut self, register: RegisterId, source: SPI::Error) -> Error<SPI::Error> {
         count(&mut self.statistics.bus_errors);
         Error::Bus { register, source }
     }
@@ -222,7 +226,7 @@ impl<T: Transport> Core<T> {
         &mut self,
         register: RegisterId,
         width: Width,
-    ) -> Result<u32, Error<T::Error>> {
+    ) -> Result<u32, Error<SPI::Error>> {
         let command = [register.address()];
         let mut buffer = [0; 3];
         let bytes = width.bytes();
@@ -232,7 +236,10 @@ impl<T: Transport> Core<T> {
         let gap = || Operation::DelayNs(timing.read_byte_gap_ns);
         let result = if timing.read_byte_gap_ns == 0 {
             let whole = Operation::Read(buffer.get_mut(..bytes).unwrap_or_default());
-            self.transport.transaction(&mut [write, wait, whole]).await
+            self.transport
+                .0
+                .transaction(&mut [write, wait, whole])
+                .await
         } else {
             let [first, second, third] = buffer.each_mut().map(slice::from_mut);
             let first = Operation::Read(first);
@@ -240,7 +247,7 @@ impl<T: Transport> Core<T> {
             let third = Operation::Read(third);
             let mut operations = [write, wait, first, gap(), second, gap(), third];
             let operations = operations.get_mut(..1 + 2 * bytes).unwrap_or_default();
-            self.transport.transaction(operations).await
+            self.transport.0.transaction(operations).await
         };
         result.map_err(|source| self.bus_error(register, source))?;
         Ok(from_big_endian(buffer.get(..bytes).unwrap_or_default()))
@@ -253,7 +260,7 @@ impl<T: Transport> Core<T> {
         width: Width,
         raw: u32,
         after_ns: u32,
-    ) -> Result<(), Error<T::Error>> {
+    ) -> Result<(), Error<SPI::Error>> {
         let command = [WRITE | register.address()];
         let [_, _, high, low] = raw.to_be_bytes();
         let (high, low) = ([high], [low]);
@@ -273,7 +280,7 @@ impl<T: Transport> Core<T> {
             Operation::DelayNs(after_ns),
         ];
         let operations = operations.get_mut(skipped..).unwrap_or_default();
-        let result = self.transport.transaction(operations).await;
+        let result = self.transport.0.transaction(operations).await;
         result.map_err(|source| self.bus_error(register, source))
     }
 
@@ -285,7 +292,7 @@ impl<T: Transport> Core<T> {
         register: RegisterId,
         width: Width,
         retries: u8,
-    ) -> Result<u32, Error<T::Error>> {
+    ) -> Result<u32, Error<SPI::Error>> {
         let mut retries_left = retries;
         loop {
             let read = self.receive(register, width).await?;
@@ -304,14 +311,14 @@ impl<T: Transport> Core<T> {
     }
 
     /// A register that reading does not change, with retries.
-    pub(crate) async fn read_bits(&mut self, field: Field) -> Result<u32, Error<T::Error>> {
+    pub(crate) async fn read_bits(&mut self, field: Field) -> Result<u32, Error<SPI::Error>> {
         let retries = self.options.retries;
         self.read_checked(field.register, field.width, retries)
             .await
     }
 
     /// A register that reading clears.
-    pub(crate) async fn take_bits(&mut self, field: Field) -> Result<u32, Error<T::Error>> {
+    pub(crate) async fn take_bits(&mut self, field: Field) -> Result<u32, Error<SPI::Error>> {
         self.read_checked(field.register, field.width, 0).await
     }
 
@@ -320,7 +327,7 @@ impl<T: Transport> Core<T> {
         &mut self,
         field: Field,
         written: Option<u32>,
-    ) -> Result<(), Error<T::Error>> {
+    ) -> Result<(), Error<SPI::Error>> {
         let Field {
             register,
             width,
@@ -350,7 +357,7 @@ impl<T: Transport> Core<T> {
         }
     }
 
-    pub(crate) async fn software_reset(&mut self) -> Result<(), Error<T::Error>> {
+    pub(crate) async fn software_reset(&mut self) -> Result<(), Error<SPI::Error>> {
         // Without a configuration an offset test cannot be finished either; `configure` forgets it.
         self.is_configured = false;
         let after_reset_ns = self.options.timing.after_reset_ns;
@@ -373,18 +380,14 @@ impl<T: Transport> Core<T> {
         }
     }
 
-    /// Not `async` itself, so that the future holds no second configuration.
-    pub(crate) fn configure(
-        &mut self,
-        config: &Config,
-    ) -> impl Future<Output = Result<(), Error<T::Error>>> {
+    pub(crate) async fn configure(&mut self, config: &Config) -> Result<(), Error<SPI::Error>> {
         self.config = *config;
         self.is_configured = false;
         self.offset_test = false;
-        self.write_configuration()
+        self.write_configuration().await
     }
 
-    async fn write_configuration(&mut self) -> Result<(), Error<T::Error>> {
+    async fn write_configuration(&mut self) -> Result<(), Error<SPI::Error>> {
         if self.read_bits(MODE).await? == 0 {
             self.check_stuck_low().await?;
         }
@@ -401,7 +404,7 @@ impl<T: Transport> Core<T> {
     }
 
     /// Clears the flags and makes sure that RESET is among them, so that the next RESET is a new one.
-    async fn clear_reset_flag(&mut self) -> Result<(), Error<T::Error>> {
+    async fn clear_reset_flag(&mut self) -> Result<(), Error<SPI::Error>> {
         let mut retries_left = self.options.retries;
         loop {
             // The flags themselves do not matter here, so neither does their checksum.
@@ -424,7 +427,7 @@ impl<T: Transport> Core<T> {
     }
 
     /// After MODE has read 0, which no [`Config`] and no reset makes it: is it the line?
-    async fn check_stuck_low(&mut self) -> Result<(), Error<T::Error>> {
+    async fn check_stuck_low(&mut self) -> Result<(), Error<SPI::Error>> {
         if self.read_bits(Field::of::<Cfnum>()).await? == 0
             && self.read_bits(Field::of::<Dierev>()).await? == 0
         {
@@ -436,7 +439,7 @@ impl<T: Transport> Core<T> {
         Ok(())
     }
 
-    fn configured(&self) -> Result<Config, Error<T::Error>> {
+    fn configured(&self) -> Result<Config, Error<SPI::Error>> {
         self.config().copied().ok_or(Error::NotConfigured)
     }
 
@@ -448,7 +451,7 @@ impl<T: Transport> Core<T> {
         }
     }
 
-    async fn check_mode(&mut self) -> Result<Config, Error<T::Error>> {
+    async fn check_mode(&mut self) -> Result<Config, Error<SPI::Error>> {
         let config = self.configured()?;
         let expected = self.expected_mode(&config).bits().into();
         let read = self.read_bits(MODE).await?;
@@ -468,7 +471,7 @@ impl<T: Transport> Core<T> {
         })
     }
 
-    pub(crate) async fn verify_configuration(&mut self) -> Result<(), Error<T::Error>> {
+    pub(crate) async fn verify_configuration(&mut self) -> Result<(), Error<SPI::Error>> {
         let config = self.check_mode().await?;
         for &(field, expected) in &[
             (Field::writable::<Gain>(), config.gain.encode()),
@@ -493,7 +496,7 @@ impl<T: Transport> Core<T> {
         Ok(())
     }
 
-    pub(crate) async fn reset_detected(&mut self) -> Result<bool, Error<T::Error>> {
+    pub(crate) async fn reset_detected(&mut self) -> Result<bool, Error<SPI::Error>> {
         let status = self.read_bits(Field::of::<Status>()).await?;
         if status & u32::from(Interrupts::RESET.bits()) != 0 {
             return Ok(true);
@@ -501,12 +504,12 @@ impl<T: Transport> Core<T> {
         Ok(self.read_bits(MODE).await? == MODE_RESET)
     }
 
-    pub(crate) async fn energy(&mut self) -> Result<Aenergy, Error<T::Error>> {
+    pub(crate) async fn energy(&mut self) -> Result<Aenergy, Error<SPI::Error>> {
         let read = self.read_bits(Field::of::<Aenergy>()).await?;
         decoded(read)
     }
 
-    pub(crate) async fn energy_snapshot(&mut self) -> Result<EnergySnapshot, Error<T::Error>> {
+    pub(crate) async fn energy_snapshot(&mut self) -> Result<EnergySnapshot, Error<SPI::Error>> {
         let energy = [RegisterId::Aenergy.address()];
         let checksum = [RegisterId::Chksum.address()];
         let [mut high, mut middle, mut low, mut got] = [[0u8]; 4];
@@ -522,7 +525,7 @@ impl<T: Transport> Core<T> {
                 wait(),
                 Operation::Read(&mut got),
             ];
-            let result = self.transport.transaction(operations).await;
+            let result = self.transport.0.transaction(operations).await;
             result.map_err(|source| self.bus_error(RegisterId::Aenergy, source))?;
             let [first, second, third] = data;
             [high, middle, low] = [[first], [second], [third]];
@@ -541,7 +544,7 @@ impl<T: Transport> Core<T> {
                 wait(),
                 Operation::Read(&mut got),
             ];
-            let result = self.transport.transaction(operations).await;
+            let result = self.transport.0.transaction(operations).await;
             result.map_err(|source| self.bus_error(RegisterId::Aenergy, source))?;
         }
         let ([high], [middle], [low], [checksum]) = (high, middle, low, got);
@@ -549,12 +552,12 @@ impl<T: Transport> Core<T> {
         Ok(EnergySnapshot { raw, checksum })
     }
 
-    pub(crate) async fn waveform(&mut self) -> Result<Waveform, Error<T::Error>> {
+    pub(crate) async fn waveform(&mut self) -> Result<Waveform, Error<SPI::Error>> {
         let read = self.read_bits(Field::of::<Waveform>()).await?;
         decoded(read)
     }
 
-    pub(crate) async fn start_temperature(&mut self) -> Result<(), Error<T::Error>> {
+    pub(crate) async fn start_temperature(&mut self) -> Result<(), Error<SPI::Error>> {
         // Writing MODE after a reset nobody has noticed would hide the reset.
         let config = self.check_mode().await?;
         let mode = Mode {
@@ -564,7 +567,7 @@ impl<T: Transport> Core<T> {
         self.write_bits(MODE, mode.encode()).await
     }
 
-    pub(crate) async fn temperature(&mut self) -> Result<Option<Temp>, Error<T::Error>> {
+    pub(crate) async fn temperature(&mut self) -> Result<Option<Temp>, Error<SPI::Error>> {
         let mode: Mode = decoded(self.read_bits(MODE).await?)?;
         if mode.start_temperature {
             return Ok(None);
@@ -573,23 +576,23 @@ impl<T: Transport> Core<T> {
         decoded(read).map(Some)
     }
 
-    pub(crate) async fn take_status(&mut self) -> Result<Interrupts, Error<T::Error>> {
+    pub(crate) async fn take_status(&mut self) -> Result<Interrupts, Error<SPI::Error>> {
         let read = self.take_bits(Field::cleared::<Rststatus>()).await?;
         decoded(read).map(|Rststatus(flags)| flags)
     }
 
-    async fn end_offset_test(&mut self, config: &Config) -> Result<(), Error<T::Error>> {
+    async fn end_offset_test(&mut self, config: &Config) -> Result<(), Error<SPI::Error>> {
         self.offset_test = false;
         self.write_bits(MODE, config.mode().encode()).await
     }
 
-    async fn short_channel_1(&mut self, config: &Config) -> Result<Aenergy, Error<T::Error>> {
+    async fn short_channel_1(&mut self, config: &Config) -> Result<Aenergy, Error<SPI::Error>> {
         let mode = self.expected_mode(config).encode();
         self.write_bits(MODE, mode).await?;
         self.energy().await
     }
 
-    pub(crate) async fn start_offset_test(&mut self) -> Result<OffsetTest, Error<T::Error>> {
+    pub(crate) async fn start_offset_test(&mut self) -> Result<OffsetTest, Error<SPI::Error>> {
         let config = self.check_mode().await?;
         self.offset_test = true;
         match self.short_channel_1(&config).await {
@@ -605,7 +608,7 @@ impl<T: Transport> Core<T> {
     pub(crate) async fn finish_offset_test(
         &mut self,
         test: OffsetTest,
-    ) -> Result<EnergyDelta, Error<T::Error>> {
+    ) -> Result<EnergyDelta, Error<SPI::Error>> {
         let config = self.configured()?;
         if !self.offset_test {
             return Err(Error::OffsetTestAborted);

@@ -9,7 +9,7 @@ use crate::registers::{
 };
 #[cfg(feature = "async")]
 use crate::transport::Asynchronous;
-use crate::transport::{Blocking, run};
+use crate::transport::Blocking;
 
 /// An ADE7753 on a blocking [`embedded_hal::spi::SpiDevice`].
 #[derive(Debug)]
@@ -91,7 +91,7 @@ macro_rules! methods {
                 pub fn $name(&mut self $(, $argument: $type)*)
                     -> Result<$output, Error<SPI::Error>>
                 {
-                    run(self.core.$name($($argument),*))
+                    self.core.$name($($argument),*)
                 }
             )*
         }
@@ -261,9 +261,9 @@ macro_rules! any_register {
     };
 }
 
-macro_rules! run_now {
+macro_rules! at_once {
     ($future:expr) => {
-        run($future)
+        $future
     };
 }
 
@@ -274,7 +274,7 @@ macro_rules! wait_for {
     };
 }
 
-any_register!(Ade7753, embedded_hal::spi::SpiDevice, run_now);
+any_register!(Ade7753, embedded_hal::spi::SpiDevice, at_once);
 #[cfg(feature = "async")]
 any_register!(
     Ade7753Async,

@@ -1,9 +1,13 @@
 //! The driver's logic, once for both flavours.
 
+use both_flavours::both_flavours;
+
 use crate::error::{Error, Operation};
 use crate::sample::Sample;
 use crate::settings::{Address, Settings};
-use crate::transport::Transport;
+#[cfg(feature = "async")]
+use crate::transport::Asynchronous;
+use crate::transport::Blocking;
 
 /// Bit 7: written, starts a single conversion; read, a conversion is under way.
 const ST_BSY: u8 = 0x80;
@@ -65,10 +69,12 @@ impl<T> Core<T> {
     }
 }
 
-impl<T: Transport> Core<T> {
-    async fn write(&mut self, configuration: u8) -> Result<(), Error<T::Error>> {
+#[both_flavours]
+impl<I2C: embedded_hal_async::i2c::I2c> Core<Asynchronous<I2C>> {
+    async fn write(&mut self, configuration: u8) -> Result<(), Error<I2C::Error>> {
         let result = self
             .transport
+            .0
             .write(self.address.bits(), &[configuration])
             .await;
         result.map_err(|source| Error::Bus {
@@ -78,9 +84,9 @@ impl<T: Transport> Core<T> {
     }
 
     /// Code and busy flag of a three-byte read whose configuration is as written, disregarding ST/BSY.
-    async fn read(&mut self, expected: u8) -> Result<(i16, bool), Error<T::Error>> {
+    async fn read(&mut self, expected: u8) -> Result<(i16, bool), Error<I2C::Error>> {
         let mut data = [0; 3];
-        let result = self.transport.read(self.address.bits(), &mut data).await;
+        let result = self.transport.0.read(self.address.bits(), &mut data).await;
         result.map_err(|source| Error::Bus {
             operation: Operation::ReadOutput,
             source,
@@ -92,13 +98,13 @@ impl<T: Transport> Core<T> {
         Ok((i16::from_be_bytes([high, low]), read & ST_BSY != 0))
     }
 
-    fn lost(&mut self, expected: u8, read: u8) -> Error<T::Error> {
+    fn lost(&mut self, expected: u8, read: u8) -> Error<I2C::Error> {
         self.state = State::Idle;
         self.first = true;
         Error::ConfigurationLost { expected, read }
     }
 
-    fn sample(&self, code: i16) -> Result<Sample, Error<T::Error>> {
+    fn sample(&self, code: i16) -> Result<Sample, Error<I2C::Error>> {
         let settings = self.settings;
         let data_rate = settings.data_rate;
         if (data_rate.min_code()..=data_rate.max_code()).contains(&code) {
@@ -108,14 +114,14 @@ impl<T: Transport> Core<T> {
         }
     }
 
-    pub(crate) async fn start(&mut self) -> Result<(), Error<T::Error>> {
+    pub(crate) async fn start(&mut self) -> Result<(), Error<I2C::Error>> {
         self.state = State::Idle;
         self.write(ST_BSY | SC | self.settings.bits()).await?;
         self.state = State::Single;
         Ok(())
     }
 
-    pub(crate) async fn poll(&mut self) -> Result<Conversion, Error<T::Error>> {
+    pub(crate) async fn poll(&mut self) -> Result<Conversion, Error<I2C::Error>> {
         if self.state != State::Single {
             return Err(Error::NotStarted);
         }
@@ -131,14 +137,14 @@ impl<T: Transport> Core<T> {
         self.sample(code).map(Conversion::Ready)
     }
 
-    pub(crate) async fn start_continuous(&mut self) -> Result<(), Error<T::Error>> {
+    pub(crate) async fn start_continuous(&mut self) -> Result<(), Error<I2C::Error>> {
         self.state = State::Idle;
         self.write(ST_BSY | self.settings.bits()).await?;
         self.state = State::Continuous;
         Ok(())
     }
 
-    pub(crate) async fn read_continuous(&mut self) -> Result<Sample, Error<T::Error>> {
+    pub(crate) async fn read_continuous(&mut self) -> Result<Sample, Error<I2C::Error>> {
         if self.state != State::Continuous {
             return Err(Error::NotStarted);
         }
@@ -151,11 +157,12 @@ impl<T: Transport> Core<T> {
         self.sample(code)
     }
 
-    pub(crate) async fn general_call_reset(&mut self) -> Result<(), Error<T::Error>> {
+    pub(crate) async fn general_call_reset(&mut self) -> Result<(), Error<I2C::Error>> {
         self.state = State::Idle;
         self.first = true;
         let result = self
             .transport
+            .0
             .write(GENERAL_CALL, &[GENERAL_CALL_RESET])
             .await;
         result.map_err(|source| Error::Bus {

@@ -6,7 +6,7 @@ use crate::sample::Sample;
 use crate::settings::{Address, Settings};
 #[cfg(feature = "async")]
 use crate::transport::Asynchronous;
-use crate::transport::{Blocking, run};
+use crate::transport::Blocking;
 
 /// An ADS1100 on a blocking [`embedded_hal::i2c::I2c`].
 #[derive(Debug)]
@@ -62,7 +62,7 @@ macro_rules! methods {
             $(
                 $(#[$doc])*
                 pub fn $name(&mut self) -> Result<$output, Error<I2C::Error>> {
-                    run(self.core.$name())
+                    self.core.$name()
                 }
             )*
         }
