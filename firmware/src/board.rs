@@ -150,13 +150,14 @@ impl Edges {
 pub struct MeterLine {
     pin: PC4<Input>,
     guard: StormGuard,
+    config: StormConfig,
 }
 
 impl MeterLine {
     /// The interrupt: clears it; with one too many in the window the line is masked.
-    pub fn on_interrupt(&mut self, edges: &mut Edges, config: &StormConfig, now: Instant) {
+    pub fn on_interrupt(&mut self, edges: &mut Edges, now: Instant) {
         self.pin.clear_interrupt_pending_bit();
-        if self.guard.on_event(config, now) == StormAction::Mask {
+        if self.guard.on_event(&self.config, now) == StormAction::Mask {
             self.pin.disable_interrupt(&mut edges.exti);
         }
     }
@@ -168,11 +169,11 @@ impl MeterLine {
 
     /// Whether the chip still asks for attention after its flags were read: an event of its own for the storm guard,
     /// so that a line stuck low ends as a storm and not as an endless loop.
-    pub fn still_low(&mut self, edges: &mut Edges, config: &StormConfig, now: Instant) -> bool {
+    pub fn still_low(&mut self, edges: &mut Edges, now: Instant) -> bool {
         if self.pin.is_high() || self.guard.is_masked() {
             return false;
         }
-        if self.guard.on_event(config, now) == StormAction::Mask {
+        if self.guard.on_event(&self.config, now) == StormAction::Mask {
             self.pin.disable_interrupt(&mut edges.exti);
             return false;
         }
@@ -180,8 +181,8 @@ impl MeterLine {
     }
 
     /// Called by the meter's task: ends the rest after a storm. Whether the line has then to be looked at.
-    pub fn poll(&mut self, edges: &mut Edges, config: &StormConfig, now: Instant) -> bool {
-        let unmask = self.guard.poll(config, now) == StormAction::Unmask;
+    pub fn poll(&mut self, edges: &mut Edges, now: Instant) -> bool {
+        let unmask = self.guard.poll(&self.config, now) == StormAction::Unmask;
         if unmask {
             self.pin.clear_interrupt_pending_bit();
             self.pin.enable_interrupt(&mut edges.exti);
@@ -192,6 +193,11 @@ impl MeterLine {
     /// Times the line was masked.
     pub const fn storms(&self) -> u32 {
         self.guard.storms()
+    }
+
+    /// Takes the limits of the active configuration.
+    pub fn set_config(&mut self, config: StormConfig) {
+        self.config = config;
     }
 }
 
@@ -297,6 +303,7 @@ impl Board {
             meter_line: MeterLine {
                 pin: meter_irq,
                 guard: StormGuard::new(),
+                config: configuration.meter_line_storm,
             },
             meter_spi: spi::Device::new(dp.SPI1, meter_select, METER_SPI),
             flash_spi: spi::Device::new(dp.SPI2, flash_select, FLASH_SPI),

@@ -186,6 +186,7 @@ impl Center {
     }
 
     /// Every 10 ms. Whether high voltage is permitted.
+    #[inline(never)]
     pub fn tick(
         &mut self,
         now: Instant,

@@ -61,7 +61,6 @@ mod app {
         modbus::{Command, CommandState, Event, Readings},
         modbus_rtu::Server,
         retained::{RetainSlots, RetainedState, SavePolicy, Slot},
-        storm::StormConfig,
         units::{Duration, Instant, Nanocoulombs, elapsed},
     };
     use heapless::spsc;
@@ -103,7 +102,7 @@ mod app {
 
     /// The next time at which the milliseconds since the start divided by [`TICK_MS`] leave `phase_ms`.
     fn next_on_grid(phase_ms: u32) -> pace::Millisecond {
-        let now = Mono::now();
+        let now = pace::now();
         let into = now.duration_since_epoch().as_millis() % TICK_MS;
         now + ((phase_ms + TICK_MS - into - 1) % TICK_MS + 1).millis()
     }
@@ -169,7 +168,6 @@ mod app {
         port: Port,
         center: Center,
         administration: Administration,
-        line_storm: StormConfig,
     }
 
     #[local]
@@ -234,7 +232,6 @@ mod app {
                 saved: None,
                 flash_counters: [0; 5],
             },
-            line_storm: configuration.meter_line_storm,
         };
         let local = Local {
             watchdog: board.watchdog,
@@ -327,18 +324,17 @@ mod app {
     }
 
     /// IRQ of the meter. Deadline 20 ms, the next poll: it only backs the poll up.
-    #[task(binds = EXTI4, priority = 3, shared = [edges, meter_line, line_storm])]
+    #[task(binds = EXTI4, priority = 3, shared = [edges, meter_line])]
     fn meter_interrupt(cx: meter_interrupt::Context) {
         let now = time::now();
-        (cx.shared.edges, cx.shared.meter_line, cx.shared.line_storm)
-            .lock(|edges, line, storm| line.on_interrupt(edges, storm, now));
+        (cx.shared.edges, cx.shared.meter_line).lock(|edges, line| line.on_interrupt(edges, now));
         ask_meter(event::IRQ);
     }
 
     /// The meter's owner. Deadline 100 µs from a range edge to the latching of AENERGY: a miss lets counts of the new
     /// range carry the old range's scale, 48 mC per 100 µs from 600 to 60 A, corrected by the known delay. The poll's
     /// deadline is 20 ms; nothing is lost before the accumulator is half full, 469 s.
-    #[task(priority = 3, local = [meter], shared = [edges, meter_line, meter_link, line_storm])]
+    #[task(priority = 3, local = [meter], shared = [edges, meter_line, meter_link])]
     async fn meter_owner(
         mut cx: meter_owner::Context,
         charge: Option<Nanocoulombs>,
@@ -440,12 +436,8 @@ mod app {
                 cx.shared.meter_line.lock(|line| line.clear_pending());
                 let status = meter.take_status();
                 defmt::debug!("meter: {}", status);
-                interrupt = (
-                    &mut cx.shared.edges,
-                    &mut cx.shared.meter_line,
-                    &mut cx.shared.line_storm,
-                )
-                    .lock(|edges, line, storm| line.still_low(edges, storm, now));
+                interrupt = (&mut cx.shared.edges, &mut cx.shared.meter_line)
+                    .lock(|edges, line| line.still_low(edges, now));
             } else {
                 worked = false;
             }
@@ -458,31 +450,27 @@ mod app {
             let masked = cx.shared.edges.lock(|edges| edges.is_masked());
             let until = if edge || masked || waits {
                 // The rest after a storm ends 1 … 2 ms after its beginning.
-                Mono::now() + 1.millis()
+                pace::now() + 1.millis()
             } else {
                 next_poll
             };
             // A time-out is one of the two expected outcomes.
             let _ = pace::until_event(until, wake.wait()).await;
             let now = time::now();
-            let (found, irq, storms) = (
-                &mut cx.shared.edges,
-                &mut cx.shared.meter_line,
-                &mut cx.shared.line_storm,
-            )
-                .lock(|edges, line, storm| {
+            let (found, irq, storms) =
+                (&mut cx.shared.edges, &mut cx.shared.meter_line).lock(|edges, line| {
                     let found = edges.poll(now);
-                    let irq = line.poll(edges, storm, now);
+                    let irq = line.poll(edges, now);
                     (found, irq, edges.storms().saturating_add(line.storms()))
                 });
             cx.shared.meter_link.lock(|link| link.storms = storms);
             edge |= found | core::mem::take(&mut waits);
             bound |= found;
             interrupt |= irq;
-            if Mono::now() >= next_poll {
+            if pace::now() >= next_poll {
                 (verify, poll) = (true, true);
                 next_poll += METER_POLL_MS.millis();
-                if Mono::now() >= next_poll {
+                if pace::now() >= next_poll {
                     next_poll = next_on_grid(METER_PHASE_MS);
                 }
             }
@@ -568,7 +556,7 @@ mod app {
         for waited_ms in first_ms..=PollPace::limit_ms(config.data_rate) {
             let code = match converter.poll(config)? {
                 Progress::Busy => {
-                    pace::until(Mono::now() + 1.millis()).await;
+                    pace::until(pace::now() + 1.millis()).await;
                     continue;
                 }
                 Progress::Discarded => None,
@@ -650,7 +638,7 @@ mod app {
     }
 
     /// The Modbus server. No deadline but the client's patience.
-    #[task(priority = 1, local = [characters_out], shared = [port, center, administration, edges, meter_link, line_storm])]
+    #[task(priority = 1, local = [characters_out], shared = [port, center, administration, edges, meter_line, meter_link])]
     async fn rs485(mut cx: rs485::Context) {
         let Some(mut wake) = RS485_WAKE.try_take_reader() else {
             return;
@@ -667,7 +655,7 @@ mod app {
             let wait_ms = server
                 .ends_at()
                 .map_or(100, |end| until_ms(end, time::now()).clamp(1, 100));
-            let _ = pace::until_event(Mono::now() + (wait_ms + 1).millis(), wake.wait()).await;
+            let _ = pace::until_event(pace::now() + (wait_ms + 1).millis(), wake.wait()).await;
             while let Some(character) = cx.local.characters_out.dequeue() {
                 let (byte, line_errors, at) = character.unpack();
                 server.on_character(byte, line_errors, at);
@@ -774,8 +762,8 @@ mod app {
             .edges
             .lock(|edges| edges.set_config(active.edge_storm));
         cx.shared
-            .line_storm
-            .lock(|storm| *storm = active.meter_line_storm);
+            .meter_line
+            .lock(|line| line.set_config(active.meter_line_storm));
     }
 
     /// Fills in what a client can read, but for the configuration.

@@ -41,6 +41,12 @@ fn queue() -> &'static TimerQueue<SystickBackend> {
     SystickBackend::timer_queue()
 }
 
+/// Now. A call, for it takes a critical section.
+#[inline(never)]
+pub fn now() -> Millisecond {
+    Mono::now()
+}
+
 /// Until `instant`. Not `Mono::delay_until`, an async function around the same future.
 pub fn until(instant: Millisecond) -> Delay<'static, SystickBackend> {
     queue().delay_until(instant.as_ticks())
@@ -48,7 +54,7 @@ pub fn until(instant: Millisecond) -> Delay<'static, SystickBackend> {
 
 /// Until at least `ms` milliseconds have passed, of which the first is no whole one.
 pub fn at_least(ms: u32) -> Delay<'static, SystickBackend> {
-    until(Mono::now() + (ms + 1).millis())
+    until(now() + (ms + 1).millis())
 }
 
 /// Until `event` or `instant`, whichever comes first.
@@ -81,7 +87,7 @@ pub async fn paced(mut work: Pin<&mut impl Future<Output = Infallible>>) {
         .await;
         match PAUSE_MS.load(Ordering::Relaxed) {
             0 => yield_now().await,
-            ms => until(Mono::now() + ms.millis()).await,
+            ms => until(now() + ms.millis()).await,
         }
     }
 }
@@ -91,9 +97,9 @@ pub fn limited(
     limit_ms: u32,
     mut work: Pin<&mut impl Future<Output = ()>>,
 ) -> impl Future<Output = ()> {
-    let end = Mono::now() + limit_ms.millis();
+    let end = now() + limit_ms.millis();
     poll_fn(move |context| {
-        if work.as_mut().poll(context).is_ready() || Mono::now() >= end {
+        if work.as_mut().poll(context).is_ready() || now() >= end {
             Poll::Ready(())
         } else {
             Poll::Pending
