@@ -150,16 +150,20 @@ fn within(offset: u32, length: usize) -> Option<u32> {
     (end <= CAPACITY).then_some(offset)
 }
 
-impl<SPI: SpiDevice> ErrorType for Flash<SPI> {
+/// The chip lent to a queue of sequential-storage. The traits are for this and not for the chip itself, of which a queue would
+/// take a `&mut`: the traits' own implementation for that wraps each of its futures in another one.
+pub struct Lent<'a, SPI>(pub &'a mut Flash<SPI>);
+
+impl<SPI: SpiDevice> ErrorType for Lent<'_, SPI> {
     type Error = Error<SPI::Error>;
 }
 
-impl<SPI: SpiDevice> ReadNorFlash for Flash<SPI> {
+impl<SPI: SpiDevice> ReadNorFlash for Lent<'_, SPI> {
     const READ_SIZE: usize = 1;
 
     async fn read(&mut self, offset: u32, bytes: &mut [u8]) -> Result<(), Self::Error> {
         let offset = within(offset, bytes.len()).ok_or(Error::OutOfBounds)?;
-        self.transfer(&command(READ, offset), bytes)?;
+        self.0.transfer(&command(READ, offset), bytes)?;
         pause(0).await;
         Ok(())
     }
@@ -169,7 +173,7 @@ impl<SPI: SpiDevice> ReadNorFlash for Flash<SPI> {
     }
 }
 
-impl<SPI: SpiDevice> NorFlash for Flash<SPI> {
+impl<SPI: SpiDevice> NorFlash for Lent<'_, SPI> {
     const WRITE_SIZE: usize = 1;
     const ERASE_SIZE: usize = SECTOR;
 
@@ -182,11 +186,12 @@ impl<SPI: SpiDevice> NorFlash for Flash<SPI> {
         }
         let mut at = from;
         while at < to {
-            self.enable_write()?;
+            self.0.enable_write()?;
             self.0
+                .0
                 .write(&command(SECTOR_ERASE, at))
                 .map_err(Error::Bus)?;
-            self.wait(ERASE_LIMIT_MS).await?;
+            self.0.wait(ERASE_LIMIT_MS).await?;
             at += sector;
         }
         Ok(())
@@ -199,15 +204,16 @@ impl<SPI: SpiDevice> NorFlash for Flash<SPI> {
             // A program wraps within its page.
             let room = usize::try_from(PAGE - at % PAGE).unwrap_or(1);
             let (now, later) = left.split_at(room.min(left.len()));
-            self.enable_write()?;
+            self.0.enable_write()?;
             self.0
+                .0
                 .transaction(&mut [
                     Operation::Write(&command(PAGE_PROGRAM, at)),
                     Operation::Write(now),
                 ])
                 .map_err(Error::Bus)?;
-            self.wait(PROGRAM_LIMIT_MS).await?;
-            self.compare(at, now)?;
+            self.0.wait(PROGRAM_LIMIT_MS).await?;
+            self.0.compare(at, now)?;
             at = at.saturating_add(u32::try_from(now.len()).unwrap_or(0));
             left = later;
         }
@@ -216,4 +222,4 @@ impl<SPI: SpiDevice> NorFlash for Flash<SPI> {
 }
 
 /// NOR flash clears bits: the same byte may be written again with more zeros.
-impl<SPI: SpiDevice> MultiwriteNorFlash for Flash<SPI> {}
+impl<SPI: SpiDevice> MultiwriteNorFlash for Lent<'_, SPI> {}

@@ -29,7 +29,11 @@ use stm32f4xx_hal::{
     pac::SPI2,
 };
 
-use crate::{flash, flash::Flash, spi};
+use crate::{
+    flash,
+    flash::{Flash, Lent},
+    spi,
+};
 
 type Chip = Flash<spi::Device<SPI2, PB12<Output>>>;
 
@@ -190,7 +194,7 @@ impl Storage {
         let (Ok(config), true) = (QueueConfig::try_new(region.clone()), self.ready) else {
             return Err(());
         };
-        let mut queue = QueueStorage::new(&mut self.flash, config, Cache::new_uncached());
+        let mut queue = QueueStorage::new(Lent(&mut self.flash), config, Cache::new_uncached());
         let mut length = None;
         let mut items = queue.iter().await.map_err(|error| log(&error))?;
         // A record that is damaged or was cut off by a loss of power has a wrong CRC: it is read, and passed over.
@@ -229,7 +233,7 @@ impl Storage {
         let mut at = region.start;
         while at < region.end {
             let mut mark = [0; 4];
-            if self.flash.read(at, &mut mark).await.is_err() || mark != [0xFF; 4] {
+            if Lent(&mut self.flash).read(at, &mut mark).await.is_err() || mark != [0xFF; 4] {
                 break;
             }
             at += SECTOR;
@@ -268,7 +272,7 @@ impl Storage {
             self.failed = true;
             return Err(());
         };
-        let mut queue = QueueStorage::new(&mut self.flash, config, Cache::new_uncached());
+        let mut queue = QueueStorage::new(Lent(&mut self.flash), config, Cache::new_uncached());
         let mut full = false;
         let result = loop {
             let result = queue.push(record, full).await;
@@ -321,7 +325,7 @@ impl Storage {
             self.log_full = false;
             return Ok(false);
         }
-        if let Err(error) = self.flash.erase(at, at + SECTOR).await {
+        if let Err(error) = Lent(&mut self.flash).erase(at, at + SECTOR).await {
             defmt::error!("flash: {}", error);
             count(&mut self.counters.failures);
             self.failed = true;
