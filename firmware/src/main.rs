@@ -948,7 +948,7 @@ mod app {
                 )
             });
             if (first_save || policy.due(&save, now, state.charge_total))
-                && storage.save_state(&state).await
+                && storage.save_state(&state).await.is_ok()
             {
                 first_save = false;
                 policy.saved(now, state.charge_total);
@@ -1052,7 +1052,7 @@ mod app {
                 });
                 // A damaged one must not replace the one that is to be loaded again.
                 if let Ok((configuration, generation)) = staged {
-                    let done = storage.save_configuration(&configuration).await;
+                    let done = storage.save_configuration(&configuration).await.is_ok();
                     if done {
                         administration
                             .lock(|administration| administration.saved = Some(generation));

@@ -241,29 +241,29 @@ impl Storage {
         at
     }
 
-    /// Writes the configuration; whether it is in the flash.
-    pub async fn save_configuration(&mut self, configuration: &Configuration) -> bool {
-        let Ok(record) = configuration::encode(configuration, &mut self.record) else {
-            return false;
-        };
-        let length = record.len();
-        self.push(CONFIGURATION, length).await.is_ok()
+    /// Writes the configuration; an error if it is not in the flash then. Like [`Storage::save_state`] it encodes at once and
+    /// returns the future of the writing alone, which both then share.
+    pub fn save_configuration(
+        &mut self,
+        configuration: &Configuration,
+    ) -> impl Future<Output = Result<bool, ()>> {
+        let record = configuration::encode(configuration, &mut self.record);
+        let length = record.ok().map(<[u8]>::len);
+        self.push(CONFIGURATION, length)
     }
 
-    /// Writes charge and state of charge; whether they are in the flash.
-    pub async fn save_state(&mut self, state: &RetainedState) -> bool {
-        let Some(buffer) = self.record.get_mut(..MAX_STATE_BYTES) else {
-            return false;
-        };
-        let Ok(record) = state.encode(buffer) else {
-            return false;
-        };
-        let length = record.len();
-        self.push(STATE, length).await.is_ok()
+    /// Writes charge and state of charge; an error if they are not in the flash then.
+    pub fn save_state(&mut self, state: &RetainedState) -> impl Future<Output = Result<bool, ()>> {
+        let buffer = self.record.get_mut(..MAX_STATE_BYTES);
+        let record = buffer.and_then(|buffer| state.encode(buffer).ok());
+        let length = record.map(<[u8]>::len);
+        self.push(STATE, length)
     }
 
-    /// Writes the first `length` bytes of `record`; whether the oldest sector had to be given up for it.
-    async fn push(&mut self, region: Range<u32>, length: usize) -> Result<bool, ()> {
+    /// Writes the first `length` bytes of `record`, if it could be encoded; whether the oldest sector had to be given up for
+    /// it.
+    async fn push(&mut self, region: Range<u32>, length: Option<usize>) -> Result<bool, ()> {
+        let length = length.ok_or(())?;
         let (Some(record), Ok(config), true) = (
             self.record.get(..length),
             QueueConfig::try_new(region),
@@ -301,12 +301,8 @@ impl Storage {
             .record
             .get_mut(..MAX_LOG_BYTES)
             .and_then(|buffer| record.encode(buffer).ok())
-            .map(|bytes| bytes.len());
-        let result = match length {
-            Some(length) => self.push(LOG, length).await,
-            None => Err(()),
-        };
-        match result {
+            .map(<[u8]>::len);
+        match self.push(LOG, length).await {
             Ok(full) => {
                 self.overwrites |= full && !self.log_full;
                 self.log_full |= full;
