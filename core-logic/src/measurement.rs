@@ -242,8 +242,8 @@ struct Prepared {
 
 /// The composition's state.
 #[derive(Clone, Copy, Debug)]
+#[repr(C)]
 pub struct Measurement {
-    prepared: Prepared,
     converter: Converter,
     converter_fault: Option<ConverterFault>,
     /// The converter's configuration before the present one, of which a conversion may be under way.
@@ -254,13 +254,11 @@ pub struct Measurement {
     /// The newest conversion was refused for its rate of change.
     rate_refused: bool,
     reading: CurrentReading,
-    average: SlidingAverage,
     open_sensor: OpenSensor,
     flag: FlagReport,
     flag_plausibility: FlagPlausibility,
     chatter_detector: ChatterDetector,
     chatter: ChatterReport,
-    compare: ChannelCompare,
     meter: MeterReport,
     gap: Gap,
     /// What faults have miscounted that were found: a meter that stood still or disagreed, a flag against the level.
@@ -272,7 +270,6 @@ pub struct Measurement {
     meter_calibration_changed: bool,
     zero: ZeroCalibration,
     zero_beyond_limit: bool,
-    sweep: Option<SupplyCalibration>,
     key: KeyCalibration,
     /// The configuration's, as they were last seen: only others replace those in use.
     key_factors_set: KeyFactors,
@@ -296,6 +293,11 @@ pub struct Measurement {
     loss: Nanocoulombs,
     started: Instant,
     now: Instant,
+    // The largest parts come last, hence `repr(C)`: the nearer a member is, the shorter is the instruction that reaches it.
+    compare: ChannelCompare,
+    sweep: Option<SupplyCalibration>,
+    average: SlidingAverage,
+    prepared: Prepared,
 }
 
 /// The meter's configuration with everything that is known about the sensor in front of it: zero drift, key-state
