@@ -215,9 +215,9 @@ pub enum Stage {
     Converter,
     /// At the reading's own time stamps, as all that follows: what is added to it.
     Ripple,
-    /// The ends of the output.
+    /// The ends of the output; of what a counter counts, at the rows of the drive.
     Rail,
-    /// What is too small to count.
+    /// What is too small to count; likewise.
     Threshold,
     /// The converter's steps.
     Step,

@@ -347,6 +347,15 @@ fn a_counter_becomes_mean_currents_and_a_reset_cuts() {
 
 /// A counter of a drive: what it counts in floor steps, of a current at 10 rows a second.
 fn counted(step_c: f64, current_a: impl Fn(f64) -> f64) -> (Problem, Vec<String>) {
+    counted_through(step_c, current_a, |i| i)
+}
+
+/// The same with what is counted of the current.
+fn counted_through(
+    step_c: f64,
+    current_a: impl Fn(f64) -> f64,
+    of: impl Fn(f64) -> f64,
+) -> (Problem, Vec<String>) {
     let mut charge = 0.0;
     let rows: Vec<Vec<f64>> = (0..6000)
         .map(|k| {
@@ -360,12 +369,39 @@ fn counted(step_c: f64, current_a: impl Fn(f64) -> f64) -> (Problem, Vec<String>
                     charge
                 },
             ];
-            charge += 0.1 * 0.5 * (current_a(t) + current_a(t + 0.1));
+            charge += 0.1 * 0.5 * (of(current_a(t)) + of(current_a(t + 0.1)));
             row
         })
         .collect();
     let model = "schema = 1\n[sensor]\n[charge]\n";
     one(model, &text("t_s,i_ref_a,q_meas_c", rows.into_iter()))
+}
+
+/// A counter's creep threshold and its rail act on the current, not on its mean between two readings: of 5 A for a fifth of each second
+/// and 1 A for the rest a threshold of 1.5 A leaves 1 A, and no threshold on their mean of 1.8 A does.
+#[test]
+fn a_counter_counts_what_comes_through_a_threshold() {
+    let current_a = |t: f64| 1.0 + 60.0 * (0.03 * t).sin() * (2.0 * t).sin().powi(8);
+    for (id, values, of) in [
+        (
+            "dead-band",
+            vec![1.5],
+            (|i| if i.abs() < 1.5 { 0.0 } else { i }) as fn(f64) -> f64,
+        ),
+        ("clipping", vec![20.0, -30.0], |i| i.clamp(-30.0, 20.0)),
+    ] {
+        let (problem, _) = counted_through(0.0, current_a, of);
+        let predicted = twin::explain::predict(&problem, &[(id.to_owned(), values)]);
+        let plain = twin::explain::predict(&problem, &[]);
+        let off = |simulated: &[f64]| {
+            let valid = (0..simulated.len()).filter(|row| problem.observed.valid[*row]);
+            valid
+                .map(|row| (problem.observed.value[row] - simulated[row]).abs())
+                .fold(0.0, f64::max)
+        };
+        assert!(off(&plain) > 1.0, "{id}: nothing to be seen");
+        assert!(off(&predicted) < 1e-9, "{id}: {}", off(&predicted));
+    }
 }
 
 #[test]

@@ -229,6 +229,15 @@ impl<'a> Chain<'a> {
             )
             .collect();
         effects.sort_by_key(|(effect, _, _)| effect.card().place());
+        // A counter counts what comes through rails and thresholds; its readings are differences of that.
+        let (counted, effects): (Vec<_>, Vec<_>) =
+            effects.into_iter().partition(|(effect, _, _)| {
+                let stage = effect.card().stage;
+                self.problem.view == View::Charge && matches!(stage, Stage::Rail | Stage::Threshold)
+            });
+        let counted = counted
+            .into_iter()
+            .map(|(effect, values, index)| Link::Effect(effect, values, index));
         let mut next = effects.into_iter().peekable();
         let mut through = |order: &mut Vec<Link<'m>>, last: Stage| {
             while let Some((effect, values, index)) =
@@ -244,6 +253,7 @@ impl<'a> Chain<'a> {
                     order.push(Link::Window);
                 }
                 through(&mut order, Stage::Converter);
+                order.extend(counted);
                 order.extend([Link::Sample, Link::Beside]);
                 through(&mut order, Stage::BatteryVoltage);
             }
