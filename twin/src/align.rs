@@ -4,6 +4,12 @@
 //! 2. Rate: the best offset of each of several blocks, and a line through them.
 //! 3. Fine: least squares over offset, rate and a smoothing of the reference (a first-order lag or a moving average,
 //!    whichever fits better), with gain and zero solved within. Without the smoothing a lag would be taken for a shift.
+//!
+//! The reference's own noise is evened out by smoothing, and between two of its rows: the squares are lower there whatever the clocks are.
+//! What its standstills show of it is taken out of them again (least squares compensated for the noise of what goes in; Söderström 2018,
+//! *Errors-in-Variables Methods in System Identification*, ch. 7).
+
+use crate::standstill;
 
 /// Points of the coarse grids: on a fine one the noise between two points hides a slow sensor, on a coarse one a fast
 /// sensor's edges are lost. The one on which the signals are most alike counts.
@@ -24,6 +30,10 @@ const WRONG_RATE: f64 = 0.02;
 const FIT_ROWS: usize = 20_000;
 /// Beyond this share of the signal's spread a residual counts in proportion and not squared.
 const HUBER_SHARE: f64 = 0.1;
+/// The reference is smoothed if the squares are lower for it by more than so many standard deviations of what noise makes of them.
+const SELDOM: f64 = 3.0;
+/// Time constants after which nothing is left of a reading.
+const FADED: f64 = 12.0;
 /// Blocks that the rate is taken from.
 const BLOCKS: usize = 6;
 
@@ -118,12 +128,16 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
     }
     let thin = thinned(sensed);
     let spread = spread(&thin.value).max(f64::MIN_POSITIVE);
+    let seldom = SELDOM * (2.0 / thin.t_s.len() as f64).sqrt();
+    let noise = standstill::noise(std::slice::from_ref(&driven.value)).unwrap_or(0.0);
     let fit = Fit {
         driven,
         sensed: &thin,
         start_s: sensed.t_s.first().copied().unwrap_or(0.0),
         span_s: sensed.span_s().max(1e-9),
         huber: HUBER_SHARE * spread,
+        noise,
+        seldom,
     };
     let step_s = thin.step_s().max(driven.step_s()).max(1e-9);
     let (coarse_s, grid_s) = coarse(driven, sensed)
@@ -156,7 +170,7 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
         }
     }
     let smooth = fit.smooth(best.shape, best.smoothing_s);
-    if let Some((offset_s, drift_s)) = fit.blocks(&smooth, best.offset_s, grid_s, step_s) {
+    if let Some((offset_s, drift_s)) = fit.blocks(&smooth.value, best.offset_s, grid_s, step_s) {
         let cost = fit.cost(&smooth, offset_s, drift_s);
         best.take(Trial {
             offset_s,
@@ -187,7 +201,7 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
     }
     fine.take(fit.descend(fine, 0.05 * step_s));
     let smooth = fit.smooth(fine.shape, fine.smoothing_s);
-    let correlation = fit.correlation(&smooth, fine.offset_s, fine.drift_s);
+    let correlation = fit.correlation(&smooth.value, fine.offset_s, fine.drift_s);
     if correlation.abs() < LEAST_CORRELATION {
         return Err(nothing_in_common(driven, sensed));
     }
@@ -347,6 +361,50 @@ fn spread(values: &[f64]) -> f64 {
     }
 }
 
+/// A series, smoothed, at its own rows.
+fn smooth(t_s: &[f64], value: &[f64], shape: Shape, smoothing_s: f64) -> Vec<f64> {
+    let mut output = value.to_vec();
+    if smoothing_s <= 0.0 {
+        return output;
+    }
+    match shape {
+        Shape::Lag => {
+            // Exact for straight lines between rows.
+            for row in 1..value.len() {
+                let h = t_s[row] - t_s[row - 1];
+                let kept = (-h / smoothing_s).exp();
+                let (from, rise) = (value[row - 1], value[row] - value[row - 1]);
+                let ramp = 1.0 - smoothing_s / h * (1.0 - kept);
+                output[row] = kept * output[row - 1] + (1.0 - kept) * from + rise * ramp;
+            }
+        }
+        Shape::Average => {
+            let mut area = vec![0.0; value.len()];
+            for row in 1..value.len() {
+                let h = t_s[row] - t_s[row - 1];
+                area[row] = area[row - 1] + 0.5 * (value[row] + value[row - 1]) * h;
+            }
+            let mut at = 0;
+            for row in 0..value.len() {
+                let from_s = t_s[row] - smoothing_s;
+                while at + 1 < row && t_s[at + 1] <= from_s {
+                    at += 1;
+                }
+                let since = from_s - t_s[at];
+                let before = if since <= 0.0 {
+                    area[at] + value[at] * since
+                } else {
+                    let h = t_s[at + 1] - t_s[at];
+                    let end = value[at] + (value[at + 1] - value[at]) * since / h;
+                    area[at] + 0.5 * (value[at] + end) * since
+                };
+                output[row] = (area[row] - before) / smoothing_s;
+            }
+        }
+    }
+    output
+}
+
 /// A point of the search.
 #[derive(Clone, Copy, Debug)]
 struct Trial {
@@ -382,62 +440,76 @@ struct Fit<'a> {
     start_s: f64,
     span_s: f64,
     huber: f64,
+    /// Noise of the reference, rms.
+    noise: f64,
+    /// Share by which the mean square of so many readings of noise is seldom off.
+    seldom: f64,
+}
+
+/// The smoothed reference at its own rows.
+struct Smoothed {
+    value: Vec<f64>,
+    /// Variance of its noise, and covariance of that in two rows that follow one another.
+    noise: [f64; 2],
+}
+
+impl Smoothed {
+    /// Variance of the noise a share of the way from one row to the next.
+    fn noise(&self, share: f64) -> f64 {
+        between(self.noise, share)
+    }
+}
+
+/// Variance a share of the way between two rows of a variance and a covariance.
+fn between([at_row, of_neighbours]: [f64; 2], share: f64) -> f64 {
+    let rest = 1.0 - share;
+    (share * share + rest * rest) * at_row + 2.0 * share * rest * of_neighbours
 }
 
 impl Fit<'_> {
-    /// The reference, smoothed, at its own rows.
-    fn smooth(&self, shape: Shape, smoothing_s: f64) -> Vec<f64> {
-        let (t_s, value) = (&self.driven.t_s, &self.driven.value);
-        let mut output = value.clone();
-        if smoothing_s <= 0.0 {
-            return output;
+    /// The reference, smoothed.
+    fn smooth(&self, shape: Shape, smoothing_s: f64) -> Smoothed {
+        Smoothed {
+            value: smooth(&self.driven.t_s, &self.driven.value, shape, smoothing_s),
+            noise: self
+                .smoothed_noise(shape, smoothing_s)
+                .map(|share| share * self.noise.powi(2)),
         }
-        match shape {
-            Shape::Lag => {
-                // Exact for straight lines between rows.
-                for row in 1..value.len() {
-                    let h = t_s[row] - t_s[row - 1];
-                    let kept = (-h / smoothing_s).exp();
-                    let (from, rise) = (value[row - 1], value[row] - value[row - 1]);
-                    let ramp = 1.0 - smoothing_s / h * (1.0 - kept);
-                    output[row] = kept * output[row - 1] + (1.0 - kept) * from + rise * ramp;
-                }
-            }
-            Shape::Average => {
-                let mut area = vec![0.0; value.len()];
-                for row in 1..value.len() {
-                    let h = t_s[row] - t_s[row - 1];
-                    area[row] = area[row - 1] + 0.5 * (value[row] + value[row - 1]) * h;
-                }
-                let mut at = 0;
-                for row in 0..value.len() {
-                    let from_s = t_s[row] - smoothing_s;
-                    while at + 1 < row && t_s[at + 1] <= from_s {
-                        at += 1;
-                    }
-                    let since = from_s - t_s[at];
-                    let before = if since <= 0.0 {
-                        area[at] + value[at] * since
-                    } else {
-                        let h = t_s[at + 1] - t_s[at];
-                        let end = value[at] + (value[at + 1] - value[at]) * since / h;
-                        area[at] + 0.5 * (value[at] + end) * since
-                    };
-                    output[row] = (area[row] - before) / smoothing_s;
-                }
-            }
-        }
-        output
     }
 
-    /// The smoothed reference beside each reading of `rows` that it covers.
+    /// What smoothing leaves of white noise of variance 1: its variance, and covariance in two rows that follow one another.
+    fn smoothed_noise(&self, shape: Shape, smoothing_s: f64) -> [f64; 2] {
+        if self.noise <= 0.0 {
+            return [0.0; 2];
+        }
+        let step_s = self.driven.step_s();
+        let reach_s = match shape {
+            Shape::Lag => FADED * smoothing_s,
+            Shape::Average => smoothing_s,
+        };
+        // The answer to a single reading of 1.
+        let rows = (reach_s / step_s) as usize + 4;
+        let t_s: Vec<f64> = (0..rows.min(FIT_ROWS))
+            .map(|row| row as f64 * step_s)
+            .collect();
+        let mut one = vec![0.0; t_s.len()];
+        one[1] = 1.0;
+        let answer = smooth(&t_s, &one, shape, smoothing_s);
+        let products = answer.windows(2).map(|pair| pair[0] * pair[1]);
+        [
+            answer.iter().map(|value| value * value).sum(),
+            products.sum(),
+        ]
+    }
+
+    /// The smoothed reference beside each reading of `rows` that it covers, and what share of the way from one row to the next that is.
     fn beside(
         &self,
         smooth: &[f64],
         offset_s: f64,
         drift_s: f64,
         rows: std::ops::Range<usize>,
-        mut take: impl FnMut(f64, f64),
+        mut take: impl FnMut(f64, f64, f64),
     ) {
         let t_ref = &self.driven.t_s;
         let mut at = 0;
@@ -457,6 +529,7 @@ impl Fit<'_> {
             take(
                 smooth[at] + (smooth[at + 1] - smooth[at]) * share,
                 self.sensed.value[row],
+                share,
             );
         }
     }
@@ -469,7 +542,7 @@ impl Fit<'_> {
         rows: std::ops::Range<usize>,
     ) -> Sums {
         let mut sums = Sums::default();
-        self.beside(smooth, offset_s, drift_s, rows, |x, y| sums.add(x, y));
+        self.beside(smooth, offset_s, drift_s, rows, |x, y, _| sums.add(x, y));
         sums
     }
 
@@ -482,9 +555,9 @@ impl Fit<'_> {
             .correlation()
     }
 
-    /// Mean cost of the residual after gain and zero.
-    fn cost(&self, smooth: &[f64], offset_s: f64, drift_s: f64) -> f64 {
-        let sums = self.sums(smooth, offset_s, drift_s, self.all());
+    /// Mean cost of the residual after gain and zero, without the part of the reference's noise.
+    fn cost(&self, smooth: &Smoothed, offset_s: f64, drift_s: f64) -> f64 {
+        let sums = self.sums(&smooth.value, offset_s, drift_s, self.all());
         let least = (LEAST_OVERLAP * 0.5 * self.sensed.t_s.len() as f64).max(10.0);
         if sums.count < least.min(0.5 * self.sensed.t_s.len() as f64) {
             return f64::INFINITY;
@@ -493,14 +566,23 @@ impl Fit<'_> {
             return f64::INFINITY;
         };
         let mut cost = 0.0;
-        self.beside(smooth, offset_s, drift_s, self.all(), |x, y| {
-            let residual = (y - zero - gain * x).abs();
-            cost += if residual <= self.huber {
-                0.5 * residual * residual
-            } else {
-                self.huber * (residual - 0.5 * self.huber)
-            };
-        });
+        self.beside(
+            &smooth.value,
+            offset_s,
+            drift_s,
+            self.all(),
+            |x, y, share| {
+                let noise = smooth.noise(share);
+                let evened = between([self.noise.powi(2), 0.0], share) - noise;
+                cost -= 0.5 * gain * gain * (noise - self.seldom * evened);
+                let residual = (y - zero - gain * x).abs();
+                cost += if residual <= self.huber {
+                    0.5 * residual * residual
+                } else {
+                    self.huber * (residual - 0.5 * self.huber)
+                };
+            },
+        );
         cost / sums.count
     }
 
@@ -526,7 +608,7 @@ impl Fit<'_> {
                 .max(0.0) as usize;
             for index in 0..=tries {
                 let offset_s = first_s + index as f64 * apart_s;
-                let sums = self.sums(&smooth, offset_s, 0.0, self.all());
+                let sums = self.sums(&smooth.value, offset_s, 0.0, self.all());
                 if sums.count < LEAST_OVERLAP * rows as f64 {
                     continue;
                 }

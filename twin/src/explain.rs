@@ -25,6 +25,7 @@ pub mod select;
 pub mod shape;
 pub mod slope;
 mod starts;
+mod steady;
 mod strays;
 mod told;
 mod trust;

@@ -320,6 +320,31 @@ impl Problem {
         matches!(&self.base, Base::Sensor(base) if base.quasi_static)
     }
 
+    /// What another reference would have the simulation say at the same moments; the readings are left out, as no simulation looks at
+    /// them.
+    pub fn driven_by(&self, reference: Series) -> Self {
+        let observed = &self.observed;
+        Self {
+            drive: Drive {
+                reference,
+                ..self.drive.clone()
+            },
+            observed: Observed {
+                t_s: observed.t_s.clone(),
+                value: Vec::new(),
+                valid: observed.valid.clone(),
+                stretches: observed.stretches.clone(),
+                moments: observed.moments.clone(),
+                ..*observed
+            },
+            name: self.name.clone(),
+            unit: self.unit.clone(),
+            base: self.base.clone(),
+            modelled: self.modelled.clone(),
+            ..*self
+        }
+    }
+
     /// The same with at most so many of its readings, evenly thinned out: the simulation still runs over every row of the drive. Means
     /// from one reading to the next stay as they are.
     pub fn thinned(mut self, most: usize) -> Self {

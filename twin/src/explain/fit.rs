@@ -54,6 +54,7 @@ pub struct Fit {
     /// Huber's loss over the rows fitted, in units of sigma².
     pub cost: f64,
     slope: Arc<OnceLock<Arc<Slope>>>,
+    evened: Arc<OnceLock<f64>>,
 }
 
 impl Fit {
@@ -68,6 +69,7 @@ impl Fit {
             residual,
             cost,
             slope: Arc::default(),
+            evened: Arc::default(),
         }
     }
 
@@ -78,6 +80,12 @@ impl Fit {
         } else {
             self.clone()
         }
+    }
+
+    /// [`Workbench::evened_out`] by its model: found once.
+    pub fn evened(&self, bench: &Workbench<'_>) -> f64 {
+        let find = || bench.evened_out(&self.model, &self.predicted);
+        *self.evened.get_or_init(find)
     }
 
     /// The slope at its model: found once.
@@ -239,6 +247,7 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
         sigma,
         cost,
         slope: Arc::new(slope),
+        evened: Arc::default(),
     }
 }
 

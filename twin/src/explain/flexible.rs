@@ -263,7 +263,7 @@ fn at_rows(bench: &Workbench<'_>, rows: &[usize], series: &[f64], earlier_s: f64
 fn columns(bench: &Workbench<'_>, rows: &[usize]) -> Vec<Vec<f64>> {
     let drive = &bench.problem.drive;
     let scale = &bench.scale;
-    let x = &drive.reference;
+    let x = &bench.steady;
     let here = at_rows(bench, rows, x, 0.0);
     let top = scale.largest.max(1e-12);
     let mut columns: Vec<Vec<f64>> = vec![vec![1.0; rows.len()], here.clone()];

@@ -11,7 +11,7 @@ use super::robust::weights;
 use super::slope::change;
 use super::workbench::{Model, Workbench};
 use crate::effects::chain::Chain;
-use crate::problem::{Drive, Observed, Problem, Series};
+use crate::problem::Problem;
 
 /// Rows to each side.
 const BESIDE: f64 = 5.0;
@@ -95,27 +95,7 @@ fn quiet(bench: &Workbench<'_>) -> Problem {
             reference[rows.start + row] = sum / (to - from) as f64;
         }
     }
-    let observed = &problem.observed;
-    Problem {
-        drive: Drive {
-            reference: Series::from(reference),
-            ..drive.clone()
-        },
-        // No simulation looks at the readings: they need not be there twice.
-        observed: Observed {
-            t_s: observed.t_s.clone(),
-            value: Vec::new(),
-            valid: observed.valid.clone(),
-            stretches: observed.stretches.clone(),
-            moments: observed.moments.clone(),
-            ..*observed
-        },
-        name: problem.name.clone(),
-        unit: problem.unit.clone(),
-        base: problem.base.clone(),
-        modelled: problem.modelled.clone(),
-        ..*problem
-    }
+    problem.driven_by(reference.into())
 }
 
 #[cfg(test)]

@@ -24,7 +24,7 @@ const CERTAIN: f64 = 2.0;
 
 /// The free curve's columns at all rows: hats between knots of the reading as designed.
 fn hats(bench: &Workbench<'_>) -> Vec<Vec<f64>> {
-    let x = &bench.plain;
+    let x = &bench.reference;
     let mut sorted = x.clone();
     sorted.sort_unstable_by(f64::total_cmp);
     let mut knots: Vec<f64> = (0..KNOTS)
@@ -88,6 +88,14 @@ pub fn without_memory(
     (without, with)
 }
 
+/// What columns hold of a series.
+fn curve(columns: &[Vec<f64>], series: &[f64]) -> Vec<f64> {
+    let mut rest = [series.to_vec()];
+    clean(&mut rest, columns);
+    let [rest] = rest;
+    change(series, &rest)
+}
+
 /// Energy of a series that columns hold.
 fn held(columns: &[Vec<f64>], series: &[f64]) -> f64 {
     let ones = vec![1.0; series.len()];
@@ -140,15 +148,24 @@ fn misfit(
     hats: &[Vec<f64>],
     seed: u64,
 ) -> Option<(usize, String)> {
-    let own = &fit.slope(bench).columns;
+    // Of what the effects' own values do, the curve of the current: with all of it, hats less that would be what a reading of the
+    // reference differs by from its standstill, which is noise.
+    let own: Vec<Vec<f64>> = fit
+        .slope(bench)
+        .columns
+        .iter()
+        .map(|column| curve(hats, column))
+        .collect();
     let mut free = hats.to_vec();
-    clean(&mut free, own);
+    clean(&mut free, &own);
     let residual = ahead_of_grid(bench, fit);
     let missed = Features::of(bench, &free).explain(&residual, seed);
     if missed.share <= CERTAIN * missed.placebo_most {
         return None;
     }
-    let left = missed.share * dot(&residual, &residual) - of_noise(bench, free.len());
+    let left = missed.share * dot(&residual, &residual)
+        - of_noise(bench, free.len())
+        - bench.standstills_left;
     let known = bench.problem.accuracy;
     let accuracy: f64 = bench
         .plain

@@ -164,7 +164,7 @@ pub(super) fn plots(bench: &Workbench<'_>, fit: &Fit, held_residual: &[f64]) -> 
         after: fit.predicted.clone(),
         // A battery's is a current, which has no place on an axis of volts or per cent.
         reference: match bench.problem.base {
-            Base::Sensor(_) => bench.reference.clone(),
+            Base::Sensor(_) => bench.plain.clone(),
             Base::Battery(_) => Vec::new(),
         },
         held_out_residual: held_residual.to_vec(),

@@ -9,12 +9,14 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use rand_distr::{Distribution as _, StandardNormal};
 
+use super::slope::change;
 use super::starts::Start;
+use super::steady::Steady;
 use super::whiten::Whitening;
 use crate::effects::chain::{Begun, Chain, Change, Nuisance, Variation};
 use crate::effects::scene::{ROUNDS, Scale};
 use crate::effects::{Clues, Effect, LIBRARY, Mark, Parameter, Stage, find_with};
-use crate::problem::{Base, Coloured, Drive, Moments, Problem, View, evenly};
+use crate::problem::{Base, Coloured, Drive, Moments, Problem, Series, View, evenly};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row). [`Problem::thinned`]
 /// does so ahead, for less memory; here it is done for what it leaves as it is.
@@ -112,6 +114,12 @@ pub struct Workbench<'a> {
     chain: Chain<'a>,
     /// Natural sizes.
     pub scale: Scale,
+    /// Noise of the reference that its standstills show in the rows of the readings, rms, in the view's unit; 0 if they show none.
+    pub reference_noise: f64,
+    /// Energy of what standstills' means are off by, which a curve of the current takes for its own.
+    pub standstills_left: f64,
+    /// Ranges of the rows that count in which the current stands still, where the reference shows noise there.
+    standstills: Vec<Range<usize>>,
     /// Observed rows that fits look at.
     pub rows: Vec<usize>,
     /// Their time in s.
@@ -120,7 +128,9 @@ pub struct Workbench<'a> {
     pub y: Vec<f64>,
     /// The simulation as designed, at those rows, as read.
     pub plain: Vec<f64>,
-    /// The reference at those rows (for battery views the current).
+    /// The drive's reference, but for what noise makes of it at a standstill: what readings are looked at over.
+    pub steady: Series,
+    /// The simulation of it as designed, at those rows (for battery views the current).
     pub reference: Vec<f64>,
     /// Ranges of those rows that are held out in turn, guards left out.
     pub blocks: Vec<Range<usize>>,
@@ -195,12 +205,25 @@ impl<'a> Workbench<'a> {
             })
             .sum();
         drop(all);
-        let reference = match &problem.base {
-            Base::Sensor(_) => plain.clone(),
-            // Battery views are read on the drive's rows or between them: the nearest is near enough for regions.
-            Base::Battery(_) => nearest(problem, &rows),
-        };
         let scale = scale(problem, &t_s, &y, &plain);
+        let found = match &problem.base {
+            Base::Sensor(_) => Steady::of(problem, &scale, &rows, [&y, &plain]),
+            // No voltage is looked at over what a reference's noise makes of a current.
+            Base::Battery(_) => None,
+        };
+        let reference_noise = found.as_ref().map_or(0.0, |still| still.noise);
+        let standstills_left = found.as_ref().map_or(0.0, |still| still.left);
+        let (steady, reference, standstills) = match (found, &problem.base) {
+            (Some(still), _) => (still.reference, still.plain, still.rows),
+            (None, base) => {
+                let reference = match base {
+                    Base::Sensor(_) => plain.clone(),
+                    // Battery views are read on the drive's rows or between them: the nearest is near enough for regions.
+                    Base::Battery(_) => nearest(problem, &rows),
+                };
+                (problem.drive.reference.clone(), reference, Vec::new())
+            }
+        };
         let blocks = blocks(&rows);
         let library: Vec<&'static dyn Effect> = LIBRARY
             .iter()
@@ -234,7 +257,11 @@ impl<'a> Workbench<'a> {
             t_s,
             y,
             plain,
+            steady,
             reference,
+            reference_noise,
+            standstills_left,
+            standstills,
             blocks,
             library,
             known: Mutex::default(),
@@ -257,6 +284,10 @@ impl<'a> Workbench<'a> {
             t_s: self.t_s.clone(),
             y: self.y.clone(),
             plain: self.plain.clone(),
+            steady: self.steady.clone(),
+            reference_noise: self.reference_noise,
+            standstills_left: self.standstills_left,
+            standstills: self.standstills.clone(),
             reference: self.reference.clone(),
             blocks: self.blocks.clone(),
             library: self.library.clone(),
@@ -390,6 +421,38 @@ impl<'a> Workbench<'a> {
             .map(|(noisy, predicted)| (noisy - predicted).powi(2))
             .filter(|change| change.is_finite())
             .sum()
+    }
+
+    /// Energy of the reference's noise that a model evens out, against the simulation as designed: the error is lower by that whatever
+    /// the physics. `predicted`: its simulation. Told by how much it moves at the standstills, where noise is all that moves.
+    pub fn evened_out(&self, model: &Model, predicted: &[f64]) -> f64 {
+        if self.reference_noise <= 0.0 {
+            return 0.0;
+        }
+        let steady = self.problem.driven_by(self.steady.clone());
+        let chain = Chain::new(&steady);
+        let moves = |model: &Model, predicted: &[f64]| -> f64 {
+            let noise = change(predicted, &self.run_on(&chain, model));
+            let each = self.standstills.iter().map(|rows| {
+                let noise = &noise[rows.clone()];
+                let mean = noise.iter().sum::<f64>() / noise.len().max(1) as f64;
+                noise
+                    .iter()
+                    .map(|value| (value - mean).powi(2))
+                    .sum::<f64>()
+            });
+            each.sum()
+        };
+        let designed = Model::default();
+        let share = moves(model, predicted) / moves(&designed, &self.run(&designed));
+        // What works between the rows evens out noise wherever it is, a threshold where the current stands at it.
+        let between = |member: &Member| member.effect.card().stage.is_between_rows();
+        let rows = if model.members.iter().any(between) {
+            self.len()
+        } else {
+            self.standstills.iter().map(Range::len).sum()
+        };
+        self.reference_noise.powi(2) * rows as f64 * (1.0 - share).max(0.0)
     }
 
     /// Puts a drawing of the noise that the model file states in place of a series; `false`, and nothing done, if that has no memory.
@@ -569,27 +632,23 @@ fn members(model: &Model) -> Vec<(&'static dyn Effect, &[f64])> {
 }
 
 fn nearest(problem: &Problem, rows: &[usize]) -> Vec<f64> {
-    let drive = &problem.drive;
-    let observed = &problem.observed;
+    let reference = &problem.drive.reference;
     rows.iter()
-        .map(|&row| {
-            if let Some(row) = observed.drive_row(row) {
-                return drive.reference[row];
-            }
-            let Some(range) = drive.segments.get(observed.segment_of(row)) else {
-                return 0.0;
-            };
-            let times = &drive.t_s[range.clone()];
-            let at = times
-                .partition_point(|t| *t <= observed.t_s[row])
-                .saturating_sub(1);
-            drive
-                .reference
-                .get(range.start + at)
-                .copied()
-                .unwrap_or_default()
-        })
+        .map(|&row| drive_row(problem, row).map_or(0.0, |row| reference[row]))
         .collect()
+}
+
+/// The drive's row at which an observed one was taken, or the last before it.
+pub(super) fn drive_row(problem: &Problem, row: usize) -> Option<usize> {
+    let (drive, observed) = (&problem.drive, &problem.observed);
+    observed.drive_row(row).or_else(|| {
+        let range = drive.segments.get(observed.segment_of(row))?;
+        let times = &drive.t_s[range.clone()];
+        let at = times
+            .partition_point(|t| *t <= observed.t_s[row])
+            .saturating_sub(1);
+        (range.start + at < range.end).then_some(range.start + at)
+    })
 }
 
 /// Standard deviation of one stamp of a series that is sent at even times, in s: each step has two. 0 where steps differ by more than
