@@ -14,9 +14,9 @@ const WINDOW: usize = 8;
 const WHITE: f64 = 0.3;
 /// Share of the windows whose largest variance is the first guess of the noise: a standstill is among the quietest.
 const QUIETEST: f64 = 0.05;
-/// Eight readings of noise have more than so many times its variance once in a thousand (chi-squared of 7).
+/// Eight readings of noise have more than so many times its variance once in a thousand (chi-squared of 7: 24.3/7).
 const CHANCE: f64 = 3.5;
-/// Median of the variance of eight readings of noise, over its mean (chi-squared of 7).
+/// Median of the variance of eight readings of noise, over its mean (chi-squared of 7: 6.346/7).
 const MEDIAN: f64 = 0.9066;
 /// The guess follows from the median of all windows that it allows, so often.
 const GUESSES: usize = 3;
@@ -24,7 +24,8 @@ const GUESSES: usize = 3;
 const STILL: f64 = 0.05;
 /// Readings belong to a standstill up to so many standard deviations from its mean.
 const WITHIN: f64 = 3.0;
-/// Variance of noise over that of what is left of it within three standard deviations.
+/// Variance of noise over that of what is left of it within three standard deviations: 1/(1 − 6·φ(3)/(2·Φ(3) − 1)) of a normal
+/// distribution.
 const MISSED: f64 = 1.0274;
 
 /// What a reference does in a window.
@@ -76,7 +77,7 @@ pub struct Evened {
     pub reference: Series,
     /// Rows of the drive in each standstill.
     pub standstills: Vec<Range<usize>>,
-    /// Variance of those about the means.
+    /// Variance of the recorded readings there about the means.
     pub variance: f64,
 }
 

@@ -15,7 +15,6 @@ use crate::standstill::{Evened, evened};
 
 /// It is noise if no more than this share of it is in the reading.
 const FOLLOWED: f64 = 0.5;
-
 /// Several rows go to a reading from so many on.
 const SEVERAL: f64 = 1.5;
 

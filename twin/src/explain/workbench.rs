@@ -430,9 +430,8 @@ impl<'a> Workbench<'a> {
             return 0.0;
         }
         let steady = self.problem.driven_by(self.steady.clone());
-        let chain = Chain::new(&steady);
-        let moves = |model: &Model, predicted: &[f64]| -> f64 {
-            let noise = change(predicted, &self.run_on(&chain, model));
+        let steady = self.run_on(&Chain::new(&steady), model);
+        let moves = |noise: &[f64]| -> f64 {
             let each = self.standstills.iter().map(|rows| {
                 let noise = &noise[rows.clone()];
                 let mean = noise.iter().sum::<f64>() / noise.len().max(1) as f64;
@@ -443,8 +442,8 @@ impl<'a> Workbench<'a> {
             });
             each.sum()
         };
-        let designed = Model::default();
-        let share = moves(model, predicted) / moves(&designed, &self.run(&designed));
+        let designed = self.as_fitted(change(&self.plain, &self.reference));
+        let share = moves(&change(predicted, &steady)) / moves(&designed);
         // What works between the rows evens out noise wherever it is, a threshold where the current stands at it.
         let between = |member: &Member| member.effect.card().stage.is_between_rows();
         let rows = if model.members.iter().any(between) {
