@@ -50,7 +50,7 @@ use strays::{name_by_place, slips};
 use told::{
     attribute, base_found, current_off, effects, fitted, plots, sentence, short, times_found,
 };
-use trust::{vague, wavering};
+use trust::{vague, vague_beside, wavering};
 use unfitted::{Unfitted, confirmed, not_there, veto};
 use verdict::{Doubt, doubt, judge, unavoidable};
 use workbench::Workbench;
@@ -390,35 +390,42 @@ fn decide(
         vague(bench, &mut selection);
     }
     shape::withdraw((bench, read), &mut selection, seed);
-    let taken_back = passed && selection.named.is_empty();
+    let mut taken_back = passed && selection.named.is_empty();
     let placed = name_by_place(bench, &mut selection);
-    let left = features.explain(&selection.fit.residual, seed);
-    let confirmed = confirmed(&selection, others);
-    let unavoidable = unavoidable(bench, &selection.fit, seed);
-    let verdict = judge(
-        bench,
-        &mut selection,
-        &features,
-        confirmed,
-        before,
-        left,
-        unavoidable,
-    );
-    let held = folds(bench, &selection.fit);
-    let not_there = not_there(bench, &selection, others);
-    let Doubt {
-        verdict,
-        names: doubted,
-        beside,
-    } = doubt(
-        bench,
-        &mut selection,
-        verdict,
-        (left, &held),
-        (confirmed, taken_back),
-        (not_there, placed.as_deref()),
-        unavoidable,
-    );
+    let (verdict, left, held, doubted, beside, confirmed) = loop {
+        let left = features.explain(&selection.fit.residual, seed);
+        let confirmed = confirmed(&selection, others);
+        let unavoidable = unavoidable(bench, &selection.fit, seed);
+        let verdict = judge(
+            bench,
+            &mut selection,
+            &features,
+            confirmed,
+            before,
+            left,
+            unavoidable,
+        );
+        let held = folds(bench, &selection.fit);
+        let not_there = not_there(bench, &selection, others);
+        let Doubt {
+            verdict,
+            names: doubted,
+            beside,
+        } = doubt(
+            bench,
+            &mut selection,
+            verdict,
+            (left, &held),
+            (confirmed, taken_back),
+            (not_there, placed.as_deref()),
+            unavoidable,
+        );
+        // With what may be another physics, values that were told may be told no more.
+        if !(doubted && vague_beside(bench, &mut selection, beside)) {
+            break (verdict, left, held, doubted, beside, confirmed);
+        }
+        taken_back |= selection.named.is_empty();
+    };
     // A file that was never fitted, with a start of its own, tells a start from physics.
     let asked = verdict != Verdict::NoMismatch && (!confirmed || selection.named.is_empty());
     let elsewhere = asked

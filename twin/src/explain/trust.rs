@@ -80,21 +80,45 @@ pub(super) fn wavering(
 /// Takes effects out again whose values the recording does not tell, or that ended where physics does; where others would do as
 /// well, the best of those whose values it does tell takes the place.
 pub(super) fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
+    let why = |member: &Member, intervals: &[[f64; 2]]| {
+        untold(&bench.scale, member, intervals).or_else(|| ended(bench, member))
+    };
+    withdraw(bench, selection, 0.0, &why);
+}
+
+/// The same of doubted names with values that are searched in steps (a period, a threshold), where so much energy may be another
+/// physics': with thousands of them to choose from, one follows a part of whatever is left. True if there were any.
+pub(super) fn vague_beside(bench: &Workbench<'_>, selection: &mut Selection, beside: f64) -> bool {
+    let in_steps = |member: &Member| {
+        let mut parameters = member.effect.card().parameters.iter();
+        parameters.any(|parameter| parameter.search == Search::Stepped && !parameter.internal)
+    };
+    let members = &selection.fit.model.members;
+    if !members.iter().any(in_steps) {
+        return false;
+    }
+    withdraw(bench, selection, beside, &|member, intervals| {
+        in_magnitudes(member, intervals, Search::Stepped)
+    })
+}
+
+/// Takes effects out, one after the other, against which their intervals say something, or puts the best of its equals in the place;
+/// `beside` as in [`intervals::intervals`]. True if there were any.
+fn withdraw(
+    bench: &Workbench<'_>,
+    selection: &mut Selection,
+    beside: f64,
+    why: &dyn Fn(&Member, &[[f64; 2]]) -> Option<String>,
+) -> bool {
     let mut refused: Vec<&'static str> = Vec::new();
     while !selection.named.is_empty() {
-        let intervals = intervals::intervals(bench, &selection.fit, 0.0);
+        let intervals = intervals::intervals(bench, &selection.fit, beside);
         let members = &selection.fit.model.members;
+        let mut asked = members.iter().zip(&intervals).enumerate();
         let found =
-            members
-                .iter()
-                .zip(&intervals)
-                .enumerate()
-                .find_map(|(index, (member, intervals))| {
-                    let untold = untold(&bench.scale, member, intervals);
-                    Some((index, untold.or_else(|| ended(bench, member))?))
-                });
+            asked.find_map(|(index, (member, intervals))| Some((index, why(member, intervals)?)));
         let Some((index, why)) = found else {
-            return;
+            break;
         };
         let id = members[index].id();
         refused.push(id);
@@ -109,6 +133,7 @@ pub(super) fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
             &|_| true,
         );
     }
+    !refused.is_empty()
 }
 
 /// Whether the last fit brought a value to the end of what is physics, where no effect is accepted; what readings show by
@@ -210,6 +235,29 @@ fn nearest(bench: &Workbench<'_>, models: Vec<Model>) -> Vec<Model> {
     nearest.map(|(_, model)| model).collect()
 }
 
+/// A value whose interval says nothing, where all of those that are searched for in a way are such: where one size is told (a knee),
+/// another (how soft it is) need not be.
+fn in_magnitudes(member: &Member, intervals: &[[f64; 2]], search: Search) -> Option<String> {
+    let parameters = member.effect.card().parameters.iter().zip(intervals);
+    let mut sizes = parameters
+        .filter(|(parameter, _)| !parameter.internal && parameter.search == search)
+        // A share of something says nothing of how large that is.
+        .filter(|(parameter, _)| search != Search::Stepped || !parameter.open);
+    let (parameter, [low, high]) = sizes.next()?;
+    let vague = |low: f64, high: f64| high > VAGUE * low;
+    (vague(*low, *high) && sizes.all(|(_, [low, high])| vague(*low, *high)))
+        .then(|| could_be(parameter, *low, *high))
+}
+
+fn could_be(parameter: &Parameter, low: f64, high: f64) -> String {
+    format!(
+        "{} could be {} … {}",
+        parameter.name,
+        short(low),
+        short(high)
+    )
+}
+
 /// Why the recording does not tell an effect's values: an interval over orders of magnitude or over all that is physics, or
 /// every size that the effect has could as well be none.
 fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<String> {
@@ -221,23 +269,16 @@ fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<Stri
             .enumerate()
             .filter(|(_, (parameter, _))| !parameter.internal)
     };
-    // Where one size is told (a knee), another (how soft it is) need not be.
-    let mut sizes = known()
-        .filter(|(_, (parameter, _))| parameter.search == Search::Logarithmic)
-        .map(|(_, (_, [low, high]))| *high > VAGUE * low)
-        .peekable();
-    let vague = sizes.peek().is_some() && sizes.all(|vague| vague);
+    let magnitudes = [Search::Logarithmic, Search::Stepped]
+        .into_iter()
+        .find_map(|search| in_magnitudes(member, intervals, search));
+    if magnitudes.is_some() {
+        return magnitudes;
+    }
     for (index, (parameter, [low, high])) in known() {
         let (lowest, highest) = member.effect.bounds(index, scale);
-        let magnitudes = vague && parameter.search == Search::Logarithmic;
-        let whole = !parameter.open && !parameter.to_top && low <= &lowest && high >= &highest;
-        if magnitudes || whole {
-            return Some(format!(
-                "{} could be {} … {}",
-                parameter.name,
-                short(*low),
-                short(*high)
-            ));
+        if !parameter.open && !parameter.to_top && low <= &lowest && high >= &highest {
+            return Some(could_be(parameter, *low, *high));
         }
     }
     // At 0 there is none of it; a knee or a frequency is where it is, and none at no value.
@@ -264,6 +305,7 @@ fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<Stri
 #[allow(clippy::unwrap_used, clippy::expect_used)]
 mod tests {
     use super::*;
+    use crate::explain::normal::dot;
     use crate::problem::{Accuracy, BatteryBase, Coloured, Drive, Observed, Problem, View};
 
     #[test]
@@ -314,6 +356,15 @@ mod tests {
         assert_eq!(says("coulombic-efficiency", &[[0.97, 0.99]]), None);
         assert_eq!(says("lag", &[[0.1, 0.4]]), None);
         assert!(says("lag", &[[0.01, 2.0]]).unwrap().contains("tau_s"));
+        // A share of a period that may be any says nothing; of one that is known it is open.
+        let window = says("sampled-window", &[[1e-4, 0.7], [0.01, 1.0], [0.0, 0.0]]);
+        assert!(window.unwrap().contains("period_s could be"));
+        assert_eq!(
+            says("sampled-window", &[[0.2, 0.7], [0.01, 1.0], [0.0, 0.0]]),
+            None
+        );
+        assert!(says("dead-band", &[[0.001, 0.7]]).is_some());
+        assert_eq!(says("dead-band", &[[0.5, 0.7]]), None);
         assert!(says("ocv-hysteresis", &[[-3.0, 1.8], [1e-6, 1e-5]]).is_some());
         assert_eq!(says("ocv-hysteresis", &[[0.01, 0.02], [60.0, 300.0]]), None);
     }
@@ -354,6 +405,33 @@ mod tests {
         let why = selection.refused.join("\n");
         assert!(saturates(&selection).is_none(), "{why}");
         assert!(why.contains("end of what is physics"), "{why}");
+    }
+
+    #[test]
+    fn a_period_that_another_physics_leaves_open_is_taken_back() {
+        // A beat of two loads, by a sensor that holds the mean of a part of each period.
+        let t_s: Vec<f64> = (0..1200).map(|row| 0.1 * f64::from(row)).collect();
+        let current: Vec<f64> = t_s
+            .iter()
+            .map(|t| 40.0 * (1.7 * t).sin() + 20.0 * (4.3 * t).sin())
+            .collect();
+        let mut problem = Problem::pair(t_s.clone(), current, vec![0.0; t_s.len()], 0.1);
+        let truth = [("sampled-window".to_owned(), vec![0.25, 0.4, 0.03])];
+        let read = crate::explain::predict(&problem, &truth).into_iter();
+        let noise = t_s.iter().map(|t| 0.14 * (9973.0 * t * t).sin());
+        problem.observed.value = read.zip(noise).map(|(read, noise)| read + noise).collect();
+        let bench = Workbench::new(&problem, &[]);
+        let mut selection = select::select(&bench, 0, &mut |_, _| {});
+        let ids = |selection: &Selection| selection.fit.model.ids();
+        assert_eq!(ids(&selection), ["sampled-window"]);
+        // As much beside it as is left says nothing against it; as much as it takes itself does.
+        let left = dot(&selection.fit.residual, &selection.fit.residual);
+        assert!(!vague_beside(&bench, &mut selection, left));
+        let taken = dot(&selection.plain.residual, &selection.plain.residual);
+        assert!(vague_beside(&bench, &mut selection, taken));
+        assert!(!ids(&selection).contains(&"sampled-window"));
+        let why = selection.refused.join("\n");
+        assert!(why.contains("sampled-window: fits, but this recording does not tell its values: period_s could be"), "{why}");
     }
 
     /// A cell under a load of steps, that relaxes as a diffusion and two branches do, read with a ripple that none of them has.
