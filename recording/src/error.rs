@@ -233,6 +233,16 @@ fn shown(text: &str) -> String {
     out
 }
 
+/// A number for a message: all of its digits, and an exponent where there would be more than 15 of them or zeros for most.
+pub fn number(value: f64) -> String {
+    // A double has 15 digits that are surely its own.
+    if value == 0.0 || !value.is_finite() || (1e-6..1e15).contains(&value.abs()) {
+        value.to_string()
+    } else {
+        format!("{value:e}")
+    }
+}
+
 /// Names in a row, for a message; many are cut off.
 pub(crate) fn listed<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
     const NAMED: usize = 20;

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use crate::{
-    error::{Kind, Result},
+    error::{Kind, Result, number},
     name,
     table::Table,
 };
@@ -101,8 +101,11 @@ fn segments(table: &Table) -> Result<Vec<Range<usize>>> {
                 Kind::TimeBackwards,
                 row,
                 name::T_S,
-                format!("{now_s} s"),
-                format!("a time not before the last row's {} s", time_s[row - 1]),
+                format!("{} s", number(now_s)),
+                format!(
+                    "a time not before the last row's {} s",
+                    number(time_s[row - 1])
+                ),
             ));
         }
         segments.push(start..row);

@@ -9,6 +9,8 @@
 //! What its standstills show of it is taken out of them again (least squares compensated for the noise of what goes in; Söderström 2018,
 //! *Errors-in-Variables Methods in System Identification*, ch. 7).
 
+use recording::error::number;
+
 use crate::standstill;
 
 /// Points of the coarse grids: on a fine one the noise between two points hides a slow sensor, on a coarse one a fast
@@ -224,7 +226,7 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
 
 fn nothing_in_common(driven: &Signal, sensed: &Signal) -> String {
     let span = |signal: &Signal| match (signal.t_s.first(), signal.t_s.last()) {
-        (Some(first), Some(last)) => format!("{first} … {last} s"),
+        (Some(first), Some(last)) => format!("{} … {} s", number(*first), number(*last)),
         _ => "no time".to_owned(),
     };
     format!(

@@ -12,7 +12,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use recording::{csv, name};
+use recording::{csv, error::number, name};
 use serde::Deserialize;
 
 pub use extended::{Found, Shift};
@@ -359,7 +359,7 @@ impl Model {
 fn positive(places: &Places<'_>, table: &str, values: &[(&str, f64)]) -> Result<(), Failure> {
     for (key, value) in values {
         if !(value.is_finite() && *value >= 0.0) {
-            return Err(places.fault(&[table, key], &value.to_string(), "a number, zero or more"));
+            return Err(places.fault(&[table, key], &number(*value), "a number, zero or more"));
         }
     }
     Ok(())
@@ -375,7 +375,7 @@ fn check_coloured(
     if noise > 0.0 && tau_s <= 0.0 {
         let expected =
             "noise_coloured_tau_s beside it, a time above 0 s; without a memory it is white noise";
-        return Err(places.fault(&[table, key], &noise.to_string(), expected));
+        return Err(places.fault(&[table, key], &number(noise), expected));
     }
     Ok(())
 }
@@ -409,7 +409,7 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
     ] {
         if !(value.is_finite() && value >= 0.0) {
             let expected = "a number, zero or more";
-            return Err(places.fault(&["sensor", "accuracy", key], &value.to_string(), expected));
+            return Err(places.fault(&["sensor", "accuracy", key], &number(value), expected));
         }
     }
     if sensor.smooth_reference && sensor.held_reference {
@@ -504,7 +504,7 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         if good {
             Ok(())
         } else {
-            Err(places.fault(&["battery", key], &value.to_string(), expected))
+            Err(places.fault(&["battery", key], &number(value), expected))
         }
     };
     let capacity = text.capacity_ah;
@@ -647,7 +647,7 @@ fn modelled(
         if !value.is_finite() && value != parameter.off {
             return Err(places.fault(
                 &["effects", id, parameter.name],
-                &value.to_string(),
+                &number(value),
                 "a finite number",
             ));
         }
@@ -658,17 +658,13 @@ fn modelled(
                 (_, f64::INFINITY) => "a number above 0".to_owned(),
                 _ => format!("a number from {lowest} to {highest}"),
             };
-            return Err(places.fault(
-                &["effects", id, parameter.name],
-                &value.to_string(),
-                &expected,
-            ));
+            return Err(places.fault(&["effects", id, parameter.name], &number(value), &expected));
         }
         ordered.push(value);
     }
     let effect = effects::find_with(id, ordered.len());
     if let Some(expected) = effect.and_then(|effect| effect.at_odds(&ordered)) {
-        let values: Vec<String> = ordered.iter().map(f64::to_string).collect();
+        let values: Vec<String> = ordered.iter().map(|value| number(*value)).collect();
         return Err(places.fault(&["effects", id], &values.join(" and "), expected));
     }
     Ok((id, ordered))

@@ -636,6 +636,59 @@ fn single_readings_that_are_wild_are_said() {
     assert!(!remarks.contains("another conductor"), "{remarks}");
 }
 
+#[test]
+fn a_number_that_is_no_reading() {
+    // Whatever the column: what is simulated depends on it.
+    let recording = |place: usize, value: &str| {
+        "t_s,i_ref_a,i_meas_a,temp_sensor_c\n".to_owned()
+            + &rows(300, |t| {
+                let mut fields = [t, current(t), current(t) + 0.5, 20.0].map(|x| x.to_string());
+                if (t * 10.0).round() == 100.0 {
+                    value.clone_into(&mut fields[place]);
+                }
+                fields.join(",")
+            })
+    };
+    for (place, name) in [(1, "i_ref_a"), (2, "i_meas_a"), (3, "temp_sensor_c")] {
+        for (value, shown) in [("1e300", "1e300"), ("-3.4e38", "-3.4e38")] {
+            let sentence = explained(PAIR, &recording(place, value));
+            let at = format!("r.csv, line 102, column {} ({name})", place + 1);
+            says(
+                &sentence,
+                &[
+                    &format!("{at}: found {shown}, expected a reading, less than 1000000000000"),
+                    "an empty field where nothing was measured",
+                ],
+            );
+        }
+    }
+    // No message has hundreds of digits.
+    for (model, recording, part) in [
+        (PAIR, recording(0, "1e300"), "the last row's 1e300 s"),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = -1e300\n",
+            good(),
+            "found -1e300, expected a capacity",
+        ),
+        (
+            PAIR,
+            "t_s,i_ref_a,i_meas_a\n".to_owned()
+                + &rows(300, |t| format!("{t},{},1e-300", current(t))),
+            "found 1e-300 in every row",
+        ),
+    ] {
+        let sentence = explained(model, &recording);
+        says(&sentence, &[part]);
+        assert!(sentence.len() < 250, "{sentence}");
+    }
+    // A column that nothing is said about may hold what it likes.
+    let noted = "t_s,i_ref_a,i_meas_a,serial\n".to_owned()
+        + &rows(300, |t| {
+            format!("{t},{},{},1e18", current(t), current(t) + 0.5)
+        });
+    report(&[("m.toml", PAIR), ("r.csv", &noted)], &[]);
+}
+
 const COUNTED: &str = "schema = 1\n[sensor]\nnoise = 0.1\n[charge]\n";
 
 /// A sensor with a counter that shows `factor` times the charge, set anew in the middle.

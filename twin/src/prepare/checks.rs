@@ -1,5 +1,7 @@
 //! What cannot be explained because the input is not what it is said to be: each its own clear error.
 
+use recording::error::number;
+
 use super::{FEWEST_ROWS, Frame, battery::PACK, seconds, series::median};
 use crate::{
     effects::{self, Stage, scene::integral},
@@ -53,7 +55,8 @@ pub(super) fn not_constant(values: &[f64], name: &str, source: &str) -> Result<(
         return Ok(());
     }
     Err(Failure::Input(format!(
-        "{source}, column {name}: found {first} in every row, expected a signal that moves"
+        "{source}, column {name}: found {} in every row, expected a signal that moves",
+        number(*first)
     )))
 }
 
@@ -63,9 +66,10 @@ pub(super) fn time_goes_on(frame: &Frame) -> Result<(), Failure> {
     let moves = t_s.windows(2).any(|pair| pair[0] != pair[1]);
     match t_s.first() {
         Some(first) if !moves && t_s.len() > 1 => Err(Failure::Input(format!(
-            "{}, column {}: found {first} in every row, expected a time in s that goes on",
+            "{}, column {}: found {} in every row, expected a time in s that goes on",
             frame.source(),
-            frame.origin("t_s")
+            frame.origin("t_s"),
+            number(*first)
         ))),
         _ => Ok(()),
     }
@@ -93,9 +97,11 @@ pub(super) fn surroundings(frame: &Frame) -> Result<(), Failure> {
             .any(|value| (lowest..=highest).contains(value));
         if low <= high && !possible {
             return Err(Failure::Input(format!(
-                "{}, column {}: found {low} … {high}, expected {unit}, {lowest} … {highest} (it may be in {instead})",
+                "{}, column {}: found {} … {}, expected {unit}, {lowest} … {highest} (it may be in {instead})",
                 frame.source(),
-                frame.origin(name)
+                frame.origin(name),
+                number(low),
+                number(high)
             )));
         }
     }
@@ -113,7 +119,8 @@ pub(super) fn milliseconds(frame: &Frame) -> Result<Option<String>, Failure> {
     let (source, column) = (frame.source(), frame.origin("t_s"));
     if let Some(late) = t_s.iter().find(|t| t.abs() > NO_TIME_S) {
         return Err(Failure::Input(format!(
-            "{source}, column {column}: found a time of {late}, expected s (since 1970 it may be in ms, µs or ns)"
+            "{source}, column {column}: found a time of {}, expected s (since 1970 it may be in ms, µs or ns)",
+            number(*late)
         )));
     }
     let mut steps: Vec<f64> = t_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
@@ -144,9 +151,10 @@ pub(super) fn moments(model: &Model, problem: &Problem) -> Result<(), Failure> {
         for (parameter, value) in card.parameters.iter().zip(values) {
             if card.stage == Stage::Clock && parameter.unit == "s" && value.abs() > span_s {
                 return Err(Failure::Input(format!(
-                    "{}, key effects.{id}.{}: found {value}, expected less than the recording's {}",
+                    "{}, key effects.{id}.{}: found {}, expected less than the recording's {}",
                     model.source,
                     parameter.name,
+                    number(*value),
                     seconds(span_s)
                 )));
             }
@@ -176,7 +184,7 @@ pub(super) fn enough(problem: &Problem, source: &str) -> Result<(), Failure> {
                 .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), t| {
                     (low.min(*t), high.max(*t))
                 });
-            format!("{} … {} s", shown(low), shown(high))
+            format!("{} … {} s", number(shown(low)), number(shown(high)))
         };
         return Err(Failure::Input(format!(
             "{source}, column {}: found readings at {} and a reference at {}, expected both at the same time",
@@ -539,8 +547,9 @@ pub(super) fn plausible(
             .fold(0.0_f64, |most, i| most.max(i.abs()));
         if beyond > 0 {
             remarks.push(format!(
-                "{reference} is beyond the sensor's full scale of {full_scale} in {beyond} of {} rows, at most {most}",
-                drive.len()
+                "{reference} is beyond the sensor's full scale of {full_scale} in {beyond} of {} rows, at most {}",
+                drive.len(),
+                number(most)
             ));
         }
     }
@@ -551,7 +560,7 @@ pub(super) fn plausible(
              {} between readings around {:.4}; such readings may keep anything from fitting",
             count(wild.places, "place"),
             shown(observed.t_s[*row]),
-            observed.value[*row],
+            number(observed.value[*row]),
             wild.between
         ));
     }
@@ -579,7 +588,8 @@ fn clipped(pairs: impl Iterator<Item = (f64, f64)> + Clone, measured: &str) -> V
         // At rest every reading may be the lowest one: then the reference does not move there either.
         if enough && spread(inside) > 0.02 * spread(references) {
             remarks.push(format!(
-                "{measured} stands at its {what} value {end} in {count} of {readings} readings: it may be clipped"
+                "{measured} stands at its {what} value {} in {count} of {readings} readings: it may be clipped",
+                number(end)
             ));
         }
     }
@@ -649,7 +659,7 @@ fn stuck(drive: &Drive, observed: &Observed, reference: &str, measured: &str) ->
             if !stands && spread(inside.clone()) > 0.3 * wide && moves(inside) {
                 return Some(format!(
                     "{reference} stands at {} for {} from {} s on while {measured} moves: the reference may be at fault",
-                    drive.reference[start],
+                    number(drive.reference[start]),
                     seconds(drive.t_s[end - 1] - drive.t_s[start]),
                     drive.t_s[start]
                 ));
@@ -686,7 +696,8 @@ pub(super) fn battery(
         let most = pairs.fold(0.0_f64, |most, (_, soc)| most.max(soc.abs()));
         if most <= 1.01 {
             return Err(Failure::Input(format!(
-                "{source}, column {name}: found values up to {most}, expected per cent, 0 to 100"
+                "{source}, column {name}: found values up to {}, expected per cent, 0 to 100",
+                number(most)
             )));
         }
         return Ok(());

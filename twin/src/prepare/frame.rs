@@ -2,10 +2,16 @@
 
 use std::ops::Range;
 
-use recording::{Error, Mapping, Recording, Table, convert, error::Kind};
+use recording::{
+    Error, Mapping, Recording, Table, convert,
+    error::{Kind, number},
+};
 
 use super::{Inputs, PAIRS, SURROUNDINGS};
 use crate::{failure::Failure, model::Model};
+
+/// No reading is as large, whatever its unit: 1000 A in billionths. What is larger is memory that nothing was written to.
+const NO_READING: f64 = 1000.0 * 1e9;
 
 /// A recording as the model file and `--map` want it seen.
 #[derive(Clone, Debug)]
@@ -64,28 +70,34 @@ impl Frame {
 
     /// A column that would be compared or used if it held numbers is not just left out.
     fn refuse_left_out(&self, model: &Model) -> Result<(), Failure> {
-        let mut used = vec!["cycle"];
-        if let Some(sensor) = &model.sensor {
-            let stated = [sensor.reference.as_deref(), sensor.measured.as_deref()];
-            used.extend(stated.into_iter().flatten());
-            if sensor.reference.is_none() || sensor.measured.is_none() {
-                used.extend(PAIRS.iter().flat_map(|(one, other)| [*one, *other]));
-            }
-            let charge = model.charge.as_ref();
-            let counter = charge.and_then(|charge| charge.column.as_deref());
-            used.push(counter.unwrap_or("q_meas_c"));
-            used.extend(SURROUNDINGS);
-        }
-        if let Some(battery) = &model.battery {
-            let current = ["i_ref_a", "i_meas_a"];
-            match &battery.current {
-                Some(stated) => used.push(stated),
-                None => used.extend(current),
-            }
-            used.extend(["soc_pct", "v_cell_v", "v_pack_v", "ah_meas_ah"]);
-            used.extend(SURROUNDINGS);
-        }
+        let used = used(model).into_iter().chain(["cycle"]);
         Ok(self.recording.table().refuse_left_out(used)?)
+    }
+
+    /// Numbers are readings, whatever the unit; else the first row that has none.
+    fn refuse_no_reading(&self, model: &Model) -> Result<(), Failure> {
+        let table = self.recording.table();
+        let first = used(model)
+            .into_iter()
+            .filter_map(|name| {
+                let values = table.column(name)?;
+                let row = values.iter().position(|value| value.abs() >= NO_READING)?;
+                Some((row, name, values[row]))
+            })
+            .min_by_key(|(row, ..)| *row);
+        let Some((row, name, value)) = first else {
+            return Ok(());
+        };
+        Err(Failure::from(table.error_at(
+            Kind::NotANumber,
+            row,
+            name,
+            number(value),
+            format!(
+                "a reading, less than {} in any unit, or an empty field where nothing was measured",
+                number(NO_READING)
+            ),
+        )))
     }
 
     /// Time of each row in s.
@@ -97,6 +109,32 @@ impl Frame {
     pub fn clocks(&self) -> &[Range<usize>] {
         self.recording.segments()
     }
+}
+
+/// Columns that a model uses if they are there; time aside.
+fn used(model: &Model) -> Vec<&str> {
+    let mut used = Vec::new();
+    if let Some(sensor) = &model.sensor {
+        let stated = [sensor.reference.as_deref(), sensor.measured.as_deref()];
+        used.extend(stated.into_iter().flatten());
+        if sensor.reference.is_none() || sensor.measured.is_none() {
+            used.extend(PAIRS.iter().flat_map(|(one, other)| [*one, *other]));
+        }
+        let charge = model.charge.as_ref();
+        let counter = charge.and_then(|charge| charge.column.as_deref());
+        used.push(counter.unwrap_or("q_meas_c"));
+        used.extend(SURROUNDINGS);
+    }
+    if let Some(battery) = &model.battery {
+        let current = ["i_ref_a", "i_meas_a"];
+        match &battery.current {
+            Some(stated) => used.push(stated),
+            None => used.extend(current),
+        }
+        used.extend(["soc_pct", "v_cell_v", "v_pack_v", "ah_meas_ah"]);
+        used.extend(SURROUNDINGS);
+    }
+    used
 }
 
 /// Reads the recording and, if there is one, the reference.
@@ -112,10 +150,14 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
             wanted.push((name.clone(), column.clone()));
         }
     }
+    let check = |frame: &Frame| {
+        frame.refuse_left_out(model)?;
+        frame.refuse_no_reading(model)
+    };
     let recording = convert::table(&inputs.recording)?;
     let Some(reference) = &inputs.reference else {
         let frame = mapped(recording, &wanted)?;
-        frame.refuse_left_out(model)?;
+        check(&frame)?;
         return Ok((frame, None));
     };
     let reference = convert::table(reference)?;
@@ -137,8 +179,8 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
         .filter(|(_, column)| reference.column(column).is_some());
     let to_reference: Vec<_> = to_reference.into_iter().chain(time).collect();
     let (frame, other) = (mapped(recording, &rest)?, mapped(reference, &to_reference)?);
-    frame.refuse_left_out(model)?;
-    other.refuse_left_out(model)?;
+    check(&frame)?;
+    check(&other)?;
     Ok((frame, Some(other)))
 }
 
