@@ -1,6 +1,9 @@
 //! The canonical CSV: UTF-8, one header line, comma, decimal point, a row per line, an empty field or NaN for a missing
 //! value. A column with anything else in it is left out.
 //!
+//! Read are fields between semicolons or tabs as well, if the header has no comma, and there a decimal comma, if it is that
+//! of all numbers of the file.
+//!
 //! Lines are split here and not by a general CSV reader, because every message must name the line it is about.
 
 use std::{
@@ -36,8 +39,9 @@ pub fn read_table(path: &Path) -> Result<Table> {
 
 /// Reads a table from memory; `source` is what messages call it.
 pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
-    let fault =
-        |kind, place, found: String, expected| Error::new(kind, source, place, found, expected);
+    let fault = |kind, place, found: String, expected: &str| {
+        Error::new(kind, source, place, found, expected)
+    };
     let text = text(source, bytes)?;
     let mut lines = Lines::new(text);
     let Some((header_line, header)) = lines.next() else {
@@ -48,14 +52,16 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
             "a header line",
         ));
     };
-    let names = names(source, header_line, header)?;
+    let separator = separator(header);
+    let names = names(source, header_line, header, separator)?;
 
     // Lines are of about the same length.
     let expected_rows = text.len() / (header.len().max(names.len() * 4) + 1);
     let mut columns = vec![Ok(Vec::with_capacity(expected_rows)); names.len()];
     let mut line_numbers = table::Lines::default();
+    let mut decimal = Decimal::new(separator);
     for (row, (number, line)) in lines.enumerate() {
-        let mut fields = Fields::new(line);
+        let mut fields = Fields::new(line, separator);
         for (column, (name, values)) in names.iter().zip(&mut columns).enumerate() {
             let place = || Place::field(number, column, name);
             let field = fields.next().ok_or_else(|| {
@@ -70,11 +76,10 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
             let Ok(numbers) = values else {
                 continue;
             };
-            match value(&field) {
+            match decimal.value(&field, number) {
                 Ok(number) => numbers.push(number),
-                Err(kind) => {
-                    let expected = "a number or an empty field";
-                    *values = Err(fault(kind, place(), quoted(&field), expected));
+                Err((kind, expected)) => {
+                    *values = Err(fault(kind, place(), quoted(&field), &expected));
                 }
             }
         }
@@ -84,7 +89,12 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
                 Kind::FieldCount,
                 Place::line(number),
                 format!("{} fields", names.len() + more),
-                "one for each column of the header",
+                // Every second column or more has a part too many.
+                if separator == b',' && 2 * more >= names.len() && !line.ends_with(',') {
+                    "one for each column of the header (numbers with a decimal comma need semicolons between them)"
+                } else {
+                    "one for each column of the header"
+                },
             ));
         }
         line_numbers.push(row, number);
@@ -128,9 +138,22 @@ fn text<'a>(source: &str, bytes: &'a [u8]) -> Result<&'a str> {
     })
 }
 
-fn names(source: &str, line: u64, header: &str) -> Result<Vec<String>> {
+/// What stands between fields: a comma, or where the header has none outside of quotation marks, a semicolon or a tab.
+fn separator(header: &str) -> u8 {
+    let mut is_quoted = false;
+    let outside = |byte: &u8| {
+        is_quoted ^= *byte == b'"';
+        !is_quoted
+    };
+    let outside: Vec<u8> = header.bytes().filter(outside).collect();
+    let separators = [b',', b';', b'\t'].into_iter();
+    let mut found = separators.filter(|separator| outside.contains(separator));
+    found.next().unwrap_or(b',')
+}
+
+fn names(source: &str, line: u64, header: &str, separator: u8) -> Result<Vec<String>> {
     let mut names: Vec<String> = Vec::new();
-    for (column, field) in Fields::new(header).enumerate() {
+    for (column, field) in Fields::new(header, separator).enumerate() {
         let place = Place {
             line: Some(line),
             column: Some(column + 1),
@@ -166,19 +189,6 @@ fn names(source: &str, line: u64, header: &str) -> Result<Vec<String>> {
         }
         names.push(name.to_owned());
     }
-    // A name with a separator of other tools in it is such a tool's header line.
-    if let [only] = names.as_slice()
-        && only.contains([';', '\t'])
-        && !header.starts_with('"')
-    {
-        return Err(Error::new(
-            Kind::Format,
-            source,
-            Place::line(line),
-            quoted(only),
-            "names separated by commas",
-        ));
-    }
     Ok(names)
 }
 
@@ -190,6 +200,51 @@ fn unclosed(source: &str, place: Place) -> Error {
         "a quotation mark without its partner",
         "both on one line",
     )
+}
+
+/// The decimal mark of a file.
+struct Decimal {
+    /// Where commas separate fields the mark is a point.
+    may_be_comma: bool,
+    /// Whether it is a comma, and the line that tells; a file of whole numbers has no mark.
+    told: Option<(bool, u64)>,
+}
+
+impl Decimal {
+    fn new(separator: u8) -> Self {
+        Self {
+            may_be_comma: separator != b',',
+            told: None,
+        }
+    }
+
+    /// A field's number; what is wrong with it, and what was expected. One mark in one file: elsewhere the other one may part
+    /// thousands.
+    fn value(&mut self, field: &str, line: u64) -> std::result::Result<f64, (Kind, String)> {
+        let plain = |kind| (kind, "a number or an empty field".to_owned());
+        if !self.may_be_comma {
+            return value(field).map_err(plain);
+        }
+        let is_comma = field.contains(',');
+        if !is_comma && !field.contains('.') {
+            return value(field).map_err(plain);
+        }
+        let number = if !is_comma {
+            value(field)
+        } else if field.contains('.') {
+            Err(Kind::NotANumber)
+        } else {
+            value(&field.replace(',', "."))
+        };
+        let number = number.map_err(plain)?;
+        let (told, at) = *self.told.get_or_insert((is_comma, line));
+        if told != is_comma {
+            let mark = if told { "comma" } else { "point" };
+            let expected = format!("a decimal {mark}, as in line {at}");
+            return Err((Kind::NotANumber, expected));
+        }
+        Ok(number)
+    }
 }
 
 /// A field's number, NaN for an empty one and for NaN, as other tools write what is missing.
@@ -248,11 +303,15 @@ impl<'a> Iterator for Lines<'a> {
 /// The fields of a line; `None` for one whose quotation mark is not closed.
 struct Fields<'a> {
     rest: Option<&'a str>,
+    separator: u8,
 }
 
 impl<'a> Fields<'a> {
-    fn new(line: &'a str) -> Self {
-        Self { rest: Some(line) }
+    fn new(line: &'a str, separator: u8) -> Self {
+        Self {
+            rest: Some(line),
+            separator,
+        }
     }
 
     /// A field in quotation marks, a doubled one inside stands for itself.
@@ -269,7 +328,7 @@ impl<'a> Fields<'a> {
             if let Some(inside) = rest.strip_prefix('"') {
                 field.push('"');
                 rest = inside;
-            } else if let Some(next) = rest.strip_prefix(',') {
+            } else if let Some(next) = rest.strip_prefix(char::from(self.separator)) {
                 self.rest = Some(next);
                 return Some(field.into());
             } else {
@@ -288,7 +347,7 @@ impl<'a> Iterator for Fields<'a> {
         if let Some(after_mark) = rest.strip_prefix('"') {
             return Some(self.quoted(after_mark));
         }
-        let field = match memchr::memchr(b',', rest.as_bytes()) {
+        let field = match memchr::memchr(self.separator, rest.as_bytes()) {
             Some(end) => {
                 self.rest = Some(&rest[end + 1..]);
                 &rest[..end]

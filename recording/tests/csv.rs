@@ -49,7 +49,7 @@ fn takes_what_spreadsheets_write() {
 /// Each fault with the sentence it is told in.
 #[test]
 fn every_fault_has_its_place() {
-    let cases: [(&str, Kind, &str); 21] = [
+    let cases: [(&str, Kind, &str); 25] = [
         (
             "",
             Kind::Empty,
@@ -81,9 +81,24 @@ fn every_fault_has_its_place() {
             "r.csv, line 2, column 2: found an empty field, expected a name for each column",
         ),
         (
-            "t_s;i_ref_a\n0;1\n",
-            Kind::Format,
-            "r.csv, line 1: found \"t_s;i_ref_a\", expected names separated by commas",
+            "t_s;i_ref_a\n0;1\n1,5;2.5\n",
+            Kind::NotANumber,
+            "r.csv, line 3, column 2 (i_ref_a): found \"2.5\", expected a decimal comma, as in line 3",
+        ),
+        (
+            "t_s\ti_ref_a\n0\t0.5\n1\t1,234\n",
+            Kind::NotANumber,
+            "r.csv, line 3, column 2 (i_ref_a): found \"1,234\", expected a decimal point, as in line 2",
+        ),
+        (
+            "t_s;i_ref_a\n0,5;1.234,5\n",
+            Kind::NotANumber,
+            "r.csv, line 2, column 2 (i_ref_a): found \"1.234,5\", expected a number or an empty field",
+        ),
+        (
+            "t_s;i_ref_a\n0;1;2\n",
+            Kind::FieldCount,
+            "r.csv, line 2: found 3 fields, expected one for each column of the header",
         ),
         (
             "time,i_ref_a\n0,1\n",
@@ -98,7 +113,13 @@ fn every_fault_has_its_place() {
         (
             "t_s,i_ref_a\n0,1,5\n",
             Kind::FieldCount,
-            "r.csv, line 2: found 3 fields, expected one for each column of the header",
+            "r.csv, line 2: found 3 fields, expected one for each column of the header (numbers with a decimal comma need \
+             semicolons between them)",
+        ),
+        (
+            "t_s,i_ref_a,i_meas_a,v_cell_v\n0,1,2,3,4\n",
+            Kind::FieldCount,
+            "r.csv, line 2: found 5 fields, expected one for each column of the header",
         ),
         (
             "t_s,i_ref_a\r\n0,1\r\n1\r\n",
@@ -170,6 +191,39 @@ fn every_fault_has_its_place() {
         assert_eq!(error.kind(), kind, "{text:?}: {error}");
         assert_eq!(error.to_string(), sentence, "{text:?}");
     }
+}
+
+#[test]
+fn takes_semicolons_and_tabs_with_either_decimal_mark() {
+    let plain = recording("t_s,i_ref_a,\"a;b\"\n0,-1.5,3\n0.5,,4\n1,2e-3,5\n").unwrap();
+    for separator in [";", "\t"] {
+        for mark in [".", ","] {
+            let text = "t_s;i_ref_a;\"a;b\"\n0;-1.5;3\n0.5;;4\n1;2.e-3;\"5.0\"\n";
+            let (header, rows) = text.split_once('\n').unwrap();
+            let rows = rows.replace('.', mark).replace(';', separator);
+            let header = header.replace("a;\"", &format!("a{separator}\""));
+            let header = header.replace("t_s;", &format!("t_s{separator}"));
+            let read = recording(&format!("{header}\n{rows}")).unwrap();
+            let names: Vec<&str> = read.table().names().collect();
+            assert_eq!(names, ["t_s", "i_ref_a", "a;b"], "{separator:?}");
+            for ((name, values), (_, expected)) in
+                read.table().columns().zip(plain.table().columns())
+            {
+                let bits = |values: &[f64]| values.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+                assert_eq!(
+                    bits(values),
+                    bits(expected),
+                    "{name}, {separator:?}, {mark:?}"
+                );
+            }
+        }
+    }
+    // Text that has such a mark says nothing of the numbers' one.
+    let read = recording("t_s;date;i_ref_a\n0;25.11.2026;1,5\n1;25.11.2026;2,5\n").unwrap();
+    assert_eq!(read.need("i_ref_a").unwrap(), [1.5, 2.5]);
+    // A comma in the header is what separates.
+    let read = recording("t_s,i_ref_a,a;b\n0,1,2\n").unwrap();
+    assert_eq!(read.need("a;b").unwrap(), [2.0]);
 }
 
 #[test]
