@@ -259,6 +259,19 @@ impl Table {
         Ok(self)
     }
 
+    /// Takes the values of a column in these rows (from 0) for missing ones. A column or a row that is not there is no fault.
+    pub fn leave_out(&mut self, name: &str, rows: &[usize]) {
+        let column = self.columns.iter_mut().find(|column| column.name == name);
+        let Some(column) = column else {
+            return;
+        };
+        for row in rows {
+            if let Some(value) = column.values.get_mut(*row) {
+                *value = f64::NAN;
+            }
+        }
+    }
+
     /// With its time checked.
     pub fn into_recording(self) -> Result<Recording> {
         Recording::from_table(self)

@@ -6,6 +6,7 @@
 mod battery;
 mod charge;
 pub mod checks;
+mod codes;
 mod frame;
 mod held;
 mod phase;
@@ -156,6 +157,9 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
         checks::surroundings(frame)?;
         if let Some(remark) = checks::milliseconds(frame)? {
             work.remark(remark);
+        }
+        for remark in frame.remarks() {
+            work.remark(remark.clone());
         }
         let left_out = frame.left_out();
         if !left_out.is_empty() {

@@ -684,6 +684,73 @@ fn a_reference_that_is_missing_masks_its_reading() {
 }
 
 #[test]
+fn a_code_for_not_available_is_no_reading() {
+    let recording = |column: usize, code: f64, is_code: &dyn Fn(i32) -> bool| {
+        let rows = (0..400).map(|k| {
+            let t = f64::from(k) * 0.1;
+            let mut row = vec![t, current(t), current(t) + 0.5, 20.0 + 0.1 * t];
+            if is_code(k) {
+                row[column] = code;
+            }
+            row
+        });
+        text("t_s,i_ref_a,i_meas_a,temp_sensor_c", rows)
+    };
+    let now_and_then = |k: i32| k % 20 == 7;
+    let stretch = |k: i32| (100..160).contains(&k);
+    for code in [
+        3276.7, -3276.8, 6553.5, 65_535.0, 32_767.0, -32_768.0, -999.0, 9999.0, 65.535,
+    ] {
+        let (problem, remarks) = one(PAIR, &recording(2, code, &now_and_then));
+        assert_eq!(problem.observed.valid_rows(), 380, "{code}");
+        let [remark] = remarks.as_slice() else {
+            panic!("{code}: {remarks:?}");
+        };
+        assert!(
+            remark.starts_with(&format!("i_meas_a is {code} in 20 of 400 rows of "))
+                && remark.contains("r.csv, the first at 0.7")
+                && remark.contains("\"not available\" and is taken as missing there"),
+            "{remark}"
+        );
+        let (problem, remarks) = one(PAIR, &recording(2, code, &stretch));
+        assert_eq!(problem.observed.valid_rows(), 340, "{code}");
+        assert_eq!(remarks.len(), 1, "{remarks:?}");
+        // Nothing is simulated from it, and surroundings hold what they were.
+        let (problem, remarks) = one(PAIR, &recording(1, code, &now_and_then));
+        assert_eq!(problem.drive.len(), 380, "{code}: {remarks:?}");
+        assert_eq!(remarks.len(), 1, "{remarks:?}");
+        let (problem, remarks) = one(PAIR, &recording(3, code, &now_and_then));
+        let held = problem.drive.sensor_temperature_c.as_ref().unwrap();
+        assert!(held.iter().all(|c| (20.0..25.0).contains(c)), "{code}");
+        assert_eq!(remarks.len(), 1, "{remarks:?}");
+    }
+    // Once is a slip, any other value an end of the range, and so is a code's next to the readings.
+    let (problem, _) = one(PAIR, &recording(2, 3276.7, &|k| k == 77));
+    assert_eq!(problem.observed.valid_rows(), 400);
+    for end in [3000.0, 327.0] {
+        let (problem, remarks) = one(PAIR, &recording(2, end, &now_and_then));
+        assert_eq!(problem.observed.valid_rows(), 400);
+        assert!(
+            remarks.join("; ").contains("it may be clipped"),
+            "{remarks:?}"
+        );
+    }
+    // Pulses that a counter of 16 bits cannot show.
+    let rows = (0..400).map(|k| {
+        let t = f64::from(k) * 0.1;
+        let on = if k % 40 < 10 { 40.0 } else { 0.0 };
+        let true_a = on + 0.1 * current(t);
+        vec![t, true_a, true_a.min(32.767)]
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    assert_eq!(problem.observed.valid_rows(), 400);
+    assert!(
+        remarks.join("; ").contains("it may be clipped"),
+        "{remarks:?}"
+    );
+}
+
+#[test]
 fn holding_is_told_where_the_design_says_nothing_of_it() {
     let held = |model: &str| {
         let rows = (0..600_i32).map(|k| {

@@ -7,7 +7,7 @@ use recording::{
     error::{Kind, number},
 };
 
-use super::{Inputs, PAIRS, SURROUNDINGS};
+use super::{Inputs, PAIRS, SURROUNDINGS, codes};
 use crate::{failure::Failure, model::Model};
 
 /// No reading is as large, whatever its unit: 1000 A in billionths. What is larger is memory that nothing was written to.
@@ -19,6 +19,8 @@ pub struct Frame {
     recording: Recording,
     /// Names and the columns that they were given to.
     named: Vec<(String, String)>,
+    /// What was taken for missing.
+    remarks: Vec<String>,
 }
 
 impl Frame {
@@ -27,6 +29,7 @@ impl Frame {
         Self {
             recording,
             named: Vec::new(),
+            remarks: Vec::new(),
         }
     }
 
@@ -61,6 +64,11 @@ impl Frame {
     /// A column that must be there.
     pub fn need(&self, name: &str) -> Result<&[f64], Failure> {
         self.recording.need(name).map_err(hinted)
+    }
+
+    /// What its reader has to know: which values were taken for missing ones.
+    pub fn remarks(&self) -> &[String] {
+        &self.remarks
     }
 
     /// Columns that are in the file and hold no numbers, each with the reason.
@@ -156,7 +164,7 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
     };
     let recording = convert::table(&inputs.recording)?;
     let Some(reference) = &inputs.reference else {
-        let frame = mapped(recording, &wanted)?;
+        let frame = mapped(recording, &wanted, model)?;
         check(&frame)?;
         return Ok((frame, None));
     };
@@ -178,7 +186,10 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
         .into_iter()
         .filter(|(_, column)| reference.column(column).is_some());
     let to_reference: Vec<_> = to_reference.into_iter().chain(time).collect();
-    let (frame, other) = (mapped(recording, &rest)?, mapped(reference, &to_reference)?);
+    let (frame, other) = (
+        mapped(recording, &rest, model)?,
+        mapped(reference, &to_reference, model)?,
+    );
     check(&frame)?;
     check(&other)?;
     Ok((frame, Some(other)))
@@ -194,13 +205,32 @@ fn hinted(error: Error) -> Failure {
     Failure::Input(format!("{error}{hint}"))
 }
 
-fn mapped(table: Table, wanted: &[(String, String)]) -> Result<Frame, Failure> {
+/// The column that reads the same current or power as this one.
+fn partner<'a>(model: &'a Model, name: &str) -> Option<&'a str> {
+    let sensor = model.sensor.as_ref()?;
+    let stated = (sensor.reference.as_deref(), sensor.measured.as_deref());
+    let stated = match stated {
+        (Some(reference), Some(measured)) => Some((reference, measured)),
+        _ => None,
+    };
+    let mut pairs = stated.into_iter().chain(PAIRS);
+    pairs.find_map(|(reference, measured)| match name {
+        name if name == reference => Some(measured),
+        name if name == measured => Some(reference),
+        _ => None,
+    })
+}
+
+fn mapped(table: Table, wanted: &[(String, String)], model: &Model) -> Result<Frame, Failure> {
     let mut mapping = Mapping::new();
     for (name, column) in wanted {
         mapping.add(name, column)?;
     }
+    let mut table = table.mapped(&mapping)?;
+    let remarks = codes::leave_out(&mut table, &used(model), |name| partner(model, name));
     Ok(Frame {
-        recording: table.mapped(&mapping)?.into_recording().map_err(hinted)?,
+        recording: table.into_recording().map_err(hinted)?,
         named: wanted.to_vec(),
+        remarks,
     })
 }
