@@ -11,6 +11,7 @@ mod frame;
 mod held;
 mod phase;
 mod series;
+mod stairs;
 mod start;
 
 use std::{path::PathBuf, sync::Arc};

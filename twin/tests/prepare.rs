@@ -750,6 +750,78 @@ fn a_code_for_not_available_is_no_reading() {
     );
 }
 
+/// Remarks on a reference that is a staircase, of the current `reference` that is read every 0.1 s beside `sensor`.
+fn stairs(reference: Course<'_>, sensor: Course<'_>) -> Vec<String> {
+    let rows = (0..2000).map(|k| {
+        let noise = 0.05 * ((12.9898 * f64::from(k)).sin() * 43_758.547).fract();
+        vec![f64::from(k) * 0.1, reference(k), sensor(k) + noise]
+    });
+    let (_, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    let about = |remark: &String| remark.contains("more seldom than it was written");
+    remarks.into_iter().filter(about).collect()
+}
+
+/// A value for each row.
+type Course<'a> = &'a dyn Fn(i32) -> f64;
+
+/// A current that is set anew every ten rows.
+fn set(k: i32) -> f64 {
+    100.0 * ((78.233 * f64::from(k.div_euclid(10))).sin() * 43_758.547).fract()
+}
+
+#[test]
+fn a_reference_that_is_repeated_is_a_staircase() {
+    let at = |k: i32| current(0.1 * f64::from(k));
+    for rows in [3, 5, 10, 20] {
+        let stands = move |k: i32| at(k - k % rows);
+        let said = stairs(&stands, &at);
+        let [remark] = said.as_slice() else {
+            panic!("{rows}: {said:?}");
+        };
+        let start = format!("i_ref_a stays as it is for {rows} rows (");
+        assert!(remark.starts_with(&start), "{remark}");
+        assert!(remark.contains("--reference"), "{remark}");
+        // With a gain, behind a lag of a few rows, in steps of its own, after a standstill.
+        assert_eq!(stairs(&stands, &|k| 1.3 * at(k - 1) + 2.0).len(), 1);
+        assert_eq!(stairs(&|k| (10.0 * stands(k)).round() / 10.0, &at).len(), 1);
+        let rests = |k: i32| if k < 500 { 0.0 } else { at(k) };
+        assert_eq!(stairs(&|k| rests(k - k % rows), &rests).len(), 1);
+        // What is asked for: the repeats left out.
+        let once = |k: i32| if k % rows == 0 { at(k) } else { f64::NAN };
+        assert_eq!(stairs(&once, &at), [""; 0]);
+    }
+}
+
+#[test]
+fn a_current_in_steps_is_no_staircase() {
+    let at = |k: i32| current(0.1 * f64::from(k));
+    let lagging = |k: i32| {
+        (0..60)
+            .map(|back| set(k - back) * 0.8_f64.powi(back))
+            .sum::<f64>()
+            * 0.2
+    };
+    let pulses = |k: i32| if k.rem_euclid(40) < 10 { 20.0 } else { 0.0 };
+    let cases: [(Course<'_>, Course<'_>); 9] = [
+        (&at, &at),
+        // Set in steps: a sensor at once, later, before (its clock), behind a lag, in a window.
+        (&set, &set),
+        (&set, &|k| set(k - 4)),
+        (&set, &|k| set(k + 3)),
+        (&set, &lagging),
+        (&set, &|k| {
+            (0..7).map(|back| set(k - back)).sum::<f64>() / 7.0
+        }),
+        (&pulses, &|k| pulses(k - 2)),
+        // Slow currents in whole counts.
+        (&|k| (0.1 * f64::from(k)).floor(), &|k| 0.1 * f64::from(k)),
+        (&|k| at(k / 40).round(), &|k| at(k / 40)),
+    ];
+    for (case, (reference, sensor)) in cases.into_iter().enumerate() {
+        assert_eq!(stairs(reference, sensor), [""; 0], "{case}");
+    }
+}
+
 #[test]
 fn holding_is_told_where_the_design_says_nothing_of_it() {
     let held = |model: &str| {

@@ -2,7 +2,7 @@
 
 use recording::error::number;
 
-use super::{FEWEST_ROWS, Frame, battery::PACK, seconds, series::median};
+use super::{FEWEST_ROWS, Frame, battery::PACK, seconds, series::median, stairs};
 use crate::{
     effects::{self, Stage, scene::integral},
     failure::Failure,
@@ -566,6 +566,7 @@ pub(super) fn plausible(
     }
     remarks.extend(spikes(drive, observed, reference));
     remarks.extend(stuck(drive, observed, reference, measured));
+    remarks.extend(stairs::remark(drive, observed, [reference, measured]));
     remarks
 }
 
