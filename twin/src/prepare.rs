@@ -190,6 +190,11 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
             checks::enough(&item.problem, frame.source())?;
         }
     }
+    for item in &items {
+        if let Some(remark) = battery::out_of_charge(&item.problem) {
+            work.remark(remark);
+        }
+    }
     if let Some(remark) = supply_without_range(&items) {
         work.remark(remark);
     }

@@ -823,6 +823,46 @@ fn a_current_in_steps_is_no_staircase() {
 }
 
 #[test]
+fn a_cell_that_is_emptied_twice_is_said() {
+    // 1 A and what swings about it for 200 s: 0.055 Ah.
+    let recording = |sign: f64| {
+        let rows = (0..2000).map(move |k| {
+            let t = f64::from(k) * 0.1;
+            let i = sign * current(t);
+            vec![t, i, 3.6 - 0.01 * i - 0.0005 * sign * t]
+        });
+        text("t_s,i_ref_a,v_cell_v", rows)
+    };
+    let model = |capacity_ah: f64, soc: f64, more: &str| {
+        format!(
+            "schema = 1\n[battery]\ncapacity_ah = {capacity_ah}\ninitial_soc = {soc}\nohmic_resistance_ohm = 0.01\n\
+             ocv = [[0, 3.0], [1, 4.0]]\n{more}"
+        )
+    };
+    let said = |model: &str, sign: f64| {
+        let (_, remarks) = one(model, &recording(sign));
+        remarks
+            .into_iter()
+            .find(|remark| remark.contains("state of charge"))
+    };
+    let empty = said(&model(0.05, 0.9, ""), 1.0).unwrap();
+    let full = said(&model(0.05, 0.1, ""), -1.0).unwrap();
+    for (remark, end) in [(&empty, "empty"), (&full, "full")] {
+        assert!(remark.contains("behind v_cell_v runs to "), "{remark}");
+        assert!(
+            remark.contains(&format!("is beyond {end} from ")),
+            "{remark}"
+        );
+        assert!(remark.contains("capacity_ah or initial_soc"), "{remark}");
+        assert!(remark.contains("straight line"), "{remark}");
+    }
+    // Within what is known of a capacity, and with what was found on another day.
+    assert_eq!(said(&model(0.2, 0.9, ""), 1.0), None);
+    let found = "[effects.capacity]\ncapacity_ah = 0.2\n";
+    assert_eq!(said(&model(0.05, 0.9, found), 1.0), None);
+}
+
+#[test]
 fn holding_is_told_where_the_design_says_nothing_of_it() {
     let held = |model: &str| {
         let rows = (0..600_i32).map(|k| {

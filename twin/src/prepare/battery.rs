@@ -2,9 +2,12 @@
 
 use std::sync::Arc;
 
+use recording::error::number;
+
 use super::{Item, Purpose, Work, checks, held::Freshness, series, start};
 use crate::{
     effects::quantisation::lattice,
+    explain,
     failure::Failure,
     model::Battery,
     problem::{Accuracy, Base, BatteryBase, Coloured, Observed, Problem, View},
@@ -18,6 +21,9 @@ pub(super) const PACK: &str = "v_pack_v";
 const SOC: &str = "soc_pct";
 /// Columns of the current, in the order in which they are looked for.
 const CURRENTS: [&str; 2] = ["i_ref_a", "i_meas_a"];
+
+/// So much may a state of charge be beyond empty and full, in %: a capacity and a first reading are hardly known better.
+const BEYOND_PCT: f64 = 2.0;
 
 /// One problem for each column that is there.
 pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>, Failure> {
@@ -161,6 +167,44 @@ fn grid(work: &mut Work<'_>, name: &str, observed: &Observed) -> f64 {
         at_most(step, 4)
     ));
     step
+}
+
+/// Says so where the simulation, with the model file's effects, empties or fills a cell by more than all it has.
+pub(super) fn out_of_charge(problem: &Problem) -> Option<String> {
+    let Base::Battery(base) = &problem.base else {
+        return None;
+    };
+    let counted = Problem {
+        view: View::StateOfCharge,
+        ..problem.clone()
+    };
+    let soc_pct = explain::predict(&counted, &[]);
+    let t_s = &problem.observed.t_s;
+    // Full counts as beyond empty does: what is above 100 %, or below 0 %.
+    let beyond = |pct: f64| (pct - 100.0).max(-pct);
+    let mut at = t_s.iter().zip(&soc_pct).filter(|(_, pct)| pct.is_finite());
+    let (first_s, _) = at.clone().find(|(_, pct)| beyond(**pct) > BEYOND_PCT)?;
+    let first = at.next()?;
+    let (most_s, most) = at.fold(first, |most, now| {
+        if beyond(*now.1) > beyond(*most.1) {
+            now
+        } else {
+            most
+        }
+    });
+    let end = if *most > 100.0 { "full" } else { "empty" };
+    let straight = if base.ocv.is_empty() || problem.view == View::StateOfCharge {
+        ""
+    } else {
+        "; the open-circuit voltage is continued in a straight line there"
+    };
+    Some(format!(
+        "the simulated state of charge behind {} runs to {most:.1} % at {} s, and is beyond {end} from {} s on: capacity_ah or \
+         initial_soc may be off, or the current's unit or sign{straight}",
+        problem.name,
+        number(*most_s),
+        number(*first_s)
+    ))
 }
 
 /// What of the battery is there and yet not compared.
