@@ -155,7 +155,9 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
     };
     for frame in [Some(&frame), reference.as_ref()].into_iter().flatten() {
         checks::time_goes_on(frame)?;
-        checks::surroundings(frame)?;
+        for remark in checks::surroundings(frame)? {
+            work.remark(remark);
+        }
         if let Some(remark) = checks::milliseconds(frame)? {
             work.remark(remark);
         }

@@ -754,7 +754,15 @@ fn surroundings_in_another_unit() {
         );
         // A row that can be makes the others faults of single rows.
         let once = recording.replacen(&format!(",{value}\n"), ",20\n", 1);
-        report(&[("m.toml", PAIR), ("r.csv", &once)], &[]);
+        let said = report(&[("m.toml", PAIR), ("r.csv", &once)], &[]);
+        says(
+            &said["remarks"].to_string(),
+            &[
+                &format!("{name} is outside "),
+                " in 299 of 300 rows of r.csv, with 20 … ",
+                "it may be in ",
+            ],
+        );
     }
 }
 

@@ -79,8 +79,9 @@ pub(super) fn time_goes_on(frame: &Frame) -> Result<(), Failure> {
 const TEMPERATURES_C: (f64, f64) = (-60.0, 200.0);
 const SUPPLIES_V: (f64, f64) = (0.0, 100.0);
 
-/// Surroundings are in the units of their names: a column of which no value can be, is not.
-pub(super) fn surroundings(frame: &Frame) -> Result<(), Failure> {
+/// Surroundings are in the units of their names: a column of which no value can be, is not. Where some cannot be, remarks.
+pub(super) fn surroundings(frame: &Frame) -> Result<Vec<String>, Failure> {
+    let mut remarks = Vec::new();
     for (name, unit, (lowest, highest), instead) in [
         ("temp_sensor_c", "°C", TEMPERATURES_C, "kelvin"),
         ("temp_cell_c", "°C", TEMPERATURES_C, "kelvin"),
@@ -92,10 +93,12 @@ pub(super) fn surroundings(frame: &Frame) -> Result<(), Failure> {
         let (low, high) = known.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
             (low.min(*value), high.max(*value))
         });
+        let known = values.iter().filter(|value| value.is_finite()).count();
         let possible = values
             .iter()
-            .any(|value| (lowest..=highest).contains(value));
-        if low <= high && !possible {
+            .filter(|value| (lowest..=highest).contains(*value))
+            .count();
+        if known > 0 && possible == 0 {
             return Err(Failure::Input(format!(
                 "{}, column {}: found {} … {}, expected {unit}, {lowest} … {highest} (it may be in {instead})",
                 frame.source(),
@@ -104,8 +107,18 @@ pub(super) fn surroundings(frame: &Frame) -> Result<(), Failure> {
                 number(high)
             )));
         }
+        if possible < known {
+            remarks.push(format!(
+                "{name} is outside {lowest} … {highest} {unit} in {} of {known} rows of {}, with {} … {}: it may be in {instead}, \
+                 or a code for \"not available\"",
+                known - possible,
+                frame.source(),
+                number(low),
+                number(high)
+            ));
+        }
     }
-    Ok(())
+    Ok(remarks)
 }
 
 /// From here on a time is none in s, whatever it counts from: the year 5138.
