@@ -7,7 +7,10 @@ use embedded_storage_async::nor_flash::{
     ErrorType, MultiwriteNorFlash, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
 };
 
-use crate::{app, pace::pause};
+use crate::{
+    app,
+    pace::{self, Pace},
+};
 
 /// 32 Mbit.
 pub const CAPACITY: usize = 4 * 1024 * 1024;
@@ -81,10 +84,10 @@ impl<SPI: SpiDevice> Flash<SPI> {
 
     /// Wakes the chip and makes sure that it is the one expected: one try of 1 ms, which fails as well while an erase
     /// runs that a reset of the MCU cut off from us.
-    pub async fn start(&mut self) -> Result<(), Error<SPI::Error>> {
+    pub async fn start(&mut self, pace: Pace<'_>) -> Result<(), Error<SPI::Error>> {
         self.0.write(&[RELEASE_POWER_DOWN]).map_err(Error::Bus)?;
-        // 3 µs until it listens; the next millisecond may begin sooner.
-        pause(2).await;
+        // 3 µs until it listens.
+        pace.pause(pace::whole(1)).await;
         if self.status()? & STATUS_BUSY != 0 {
             return Err(Error::Timeout);
         }
@@ -109,13 +112,13 @@ impl<SPI: SpiDevice> Flash<SPI> {
         Ok(status)
     }
 
-    async fn wait(&mut self, limit_ms: u32) -> Result<(), Error<SPI::Error>> {
+    async fn wait(&mut self, pace: Pace<'_>, limit_ms: u32) -> Result<(), Error<SPI::Error>> {
         for _ in 0..=limit_ms {
             if self.status()? & STATUS_BUSY == 0 {
                 return Ok(());
             }
             app::alive(Task::Storage);
-            pause(1).await;
+            pace.pause(1).await;
         }
         Err(Error::Timeout)
     }
@@ -152,7 +155,7 @@ fn within(offset: u32, length: usize) -> Option<u32> {
 
 /// The chip lent to a queue of sequential-storage. The traits are for this and not for the chip itself, of which a queue would
 /// take a `&mut`: the traits' own implementation for that wraps each of its futures in another one.
-pub struct Lent<'a, SPI>(pub &'a mut Flash<SPI>);
+pub struct Lent<'a, SPI>(pub &'a mut Flash<SPI>, pub Pace<'a>);
 
 impl<SPI: SpiDevice> ErrorType for Lent<'_, SPI> {
     type Error = Error<SPI::Error>;
@@ -164,7 +167,7 @@ impl<SPI: SpiDevice> ReadNorFlash for Lent<'_, SPI> {
     async fn read(&mut self, offset: u32, bytes: &mut [u8]) -> Result<(), Self::Error> {
         let offset = within(offset, bytes.len()).ok_or(Error::OutOfBounds)?;
         self.0.transfer(&command(READ, offset), bytes)?;
-        pause(0).await;
+        self.1.pause(0).await;
         Ok(())
     }
 
@@ -191,7 +194,7 @@ impl<SPI: SpiDevice> NorFlash for Lent<'_, SPI> {
                 .0
                 .write(&command(SECTOR_ERASE, at))
                 .map_err(Error::Bus)?;
-            self.0.wait(ERASE_LIMIT_MS).await?;
+            self.0.wait(self.1, ERASE_LIMIT_MS).await?;
             at += sector;
         }
         Ok(())
@@ -212,7 +215,7 @@ impl<SPI: SpiDevice> NorFlash for Lent<'_, SPI> {
                     Operation::Write(now),
                 ])
                 .map_err(Error::Bus)?;
-            self.0.wait(PROGRAM_LIMIT_MS).await?;
+            self.0.wait(self.1, PROGRAM_LIMIT_MS).await?;
             self.0.compare(at, now)?;
             at = at.saturating_add(u32::try_from(now.len()).unwrap_or(0));
             left = later;

@@ -78,7 +78,7 @@ mod app {
         identity,
         inputs::Lines,
         meter::{self, Meter, event},
-        pace,
+        pace::{self, Pace},
         retain::{self, Previous, Stage},
         rs485::{Character, Port, QUEUE_LENGTH},
         stack,
@@ -655,7 +655,7 @@ mod app {
             let wait_ms = server
                 .ends_at()
                 .map_or(100, |end| until_ms(end, time::now()).clamp(1, 100));
-            let _ = pace::until_event(pace::now() + (wait_ms + 1).millis(), wake.wait()).await;
+            let _ = pace::until_event(pace::after(wait_ms), wake.wait()).await;
             while let Some(character) = cx.local.characters_out.dequeue() {
                 let (byte, line_errors, at) = character.unpack();
                 server.on_character(byte, line_errors, at);
@@ -848,23 +848,23 @@ mod app {
     /// power costs at most what the save policy states.
     #[task(priority = 1, local = [storage, previous], shared = [center, administration, meter_link])]
     async fn storage(cx: storage::Context) {
-        pace::paced(pin!(store(cx))).await;
+        pace::paced(async |pace| store(cx, pace).await).await;
     }
 
-    async fn store(mut cx: storage::Context<'_>) -> Infallible {
+    async fn store(mut cx: storage::Context<'_>, pace: Pace<'_>) -> Infallible {
         let storage = cx.local.storage;
         let (mut stored, mut state) = (Stored::Refused, Stored::Refused);
         let load = async {
             // A chip that answers late or wrongly once, or still erases, must not cost the calibration.
-            while !storage.start().await {
+            while !storage.start(pace).await {
                 alive(Task::Storage);
-                pace::pause(2).await;
+                pace.pause(2).await;
             }
-            stored = storage.configuration().await;
-            state = storage.state().await;
+            stored = storage.configuration(pace).await;
+            state = storage.state(pace).await;
         };
         // What has not come in time counts as refused.
-        pace::limited(LOAD_LIMIT_MS, pin!(load)).await;
+        pace.limited(LOAD_LIMIT_MS, pin!(load)).await;
         if !storage.is_ready() {
             defmt::error!("flash not ready");
         }
@@ -924,18 +924,18 @@ mod app {
         let mut clearing = false;
         loop {
             let turn_ms = if clearing { 10 } else { 100 };
-            // At least that long: the first millisecond is no whole one.
-            pace::pause(turn_ms + 1).await;
+            pace.pause(pace::whole(turn_ms)).await;
             alive(Task::Storage);
             since_log_ms += turn_ms;
             since_start_ms += turn_ms;
             if since_start_ms >= FLASH_RETRY_MS {
                 since_start_ms = 0;
                 // What it holds is read with "restore" and at the next start; what is to be saved goes there.
-                storage.start().await;
+                storage.start(pace).await;
             }
             clearing = serve(
                 storage,
+                pace,
                 &mut cx.shared.center,
                 &mut cx.shared.administration,
             )
@@ -948,7 +948,7 @@ mod app {
                 )
             });
             if (first_save || policy.due(&save, now, state.charge_total))
-                && storage.save_state(&state).await.is_ok()
+                && storage.save_state(pace, &state).await.is_ok()
             {
                 first_save = false;
                 policy.saved(now, state.charge_total);
@@ -964,7 +964,7 @@ mod app {
                     let boot = center.identity.boots;
                     center.measurement.log_record(&center.configuration, boot)
                 });
-                storage.append(&record).await;
+                storage.append(pace, &record).await;
             }
             supervise(
                 storage,
@@ -1035,6 +1035,7 @@ mod app {
     /// Save, restore, or the next sector of the log to be cleared; whether there are more of them.
     async fn serve(
         storage: &mut Storage,
+        pace: Pace<'_>,
         center: &mut impl rtic::Mutex<T = Center>,
         administration: &mut impl rtic::Mutex<T = Administration>,
     ) -> bool {
@@ -1052,7 +1053,10 @@ mod app {
                 });
                 // A damaged one must not replace the one that is to be loaded again.
                 if let Ok((configuration, generation)) = staged {
-                    let done = storage.save_configuration(&configuration).await.is_ok();
+                    let done = storage
+                        .save_configuration(pace, &configuration)
+                        .await
+                        .is_ok();
                     if done {
                         administration
                             .lock(|administration| administration.saved = Some(generation));
@@ -1063,7 +1067,7 @@ mod app {
                 }
             }
             Some(Command::Restore) => {
-                let stored = storage.configuration().await;
+                let stored = storage.configuration(pace).await;
                 let is_ready = storage.is_ready();
                 let in_use = center.lock(|center| center.measurement.retained(0).key_factors);
                 administration.lock(|administration| {
@@ -1085,7 +1089,7 @@ mod app {
                 })
             }
             // Of the three there is only this one left: the log is to be cleared.
-            Some(_) => match storage.clear_log_sector().await {
+            Some(_) => match storage.clear_log_sector(pace).await {
                 Ok(true) => return true,
                 Ok(false) => true,
                 Err(()) => false,

@@ -6,7 +6,8 @@
 use core::{
     convert::Infallible,
     future::{Future, poll_fn},
-    pin::Pin,
+    marker::PhantomData,
+    pin::{Pin, pin},
     sync::atomic::{AtomicU32, Ordering},
     task::Poll,
 };
@@ -52,9 +53,19 @@ pub fn until(instant: Millisecond) -> Delay<'static, SystickBackend> {
     queue().delay_until(instant.as_ticks())
 }
 
-/// Until at least `ms` milliseconds have passed, of which the first is no whole one.
+/// Milliseconds of the queue until `ms` have passed: the one under way is no whole one.
+pub const fn whole(ms: u32) -> u32 {
+    ms + 1
+}
+
+/// When at least `ms` milliseconds will have passed.
+pub fn after(ms: u32) -> Millisecond {
+    now() + whole(ms).millis()
+}
+
+/// Until [`after`] `ms`.
 pub fn at_least(ms: u32) -> Delay<'static, SystickBackend> {
-    until(now() + (ms + 1).millis())
+    until(after(ms))
 }
 
 /// Until `event` or `instant`, whichever comes first.
@@ -65,20 +76,45 @@ pub fn until_event<F: Future>(
     queue().timeout_at(instant.as_ticks(), event)
 }
 
-/// Within [`paced`] alone: the time until the `ms`-th next millisecond begins; with 0 as [`yield_now`].
-pub fn pause(ms: u32) -> impl Future<Output = ()> {
-    let mut said = false;
-    poll_fn(move |_| {
-        if core::mem::replace(&mut said, true) {
-            return Poll::Ready(());
-        }
-        PAUSE_MS.store(ms, Ordering::Relaxed);
-        Poll::Pending
-    })
+/// Leave to wait by [`Pace::pause`], which nobody but [`paced`] wakes from: it alone hands this out, and the lifetime keeps it
+/// within.
+#[derive(Clone, Copy)]
+pub struct Pace<'a>(PhantomData<&'a ()>);
+
+impl Pace<'_> {
+    /// The time until the `ms`-th next millisecond begins; with 0 as [`yield_now`].
+    pub fn pause(self, ms: u32) -> impl Future<Output = ()> {
+        let mut said = false;
+        poll_fn(move |_| {
+            if core::mem::replace(&mut said, true) {
+                return Poll::Ready(());
+            }
+            PAUSE_MS.store(ms, Ordering::Relaxed);
+            Poll::Pending
+        })
+    }
+
+    /// `work`, which waits by [`Pace::pause`] too, unless it has not ended `limit_ms` from now. Pinned by the caller: taken by
+    /// value it would be held twice.
+    pub fn limited(
+        self,
+        limit_ms: u32,
+        mut work: Pin<&mut impl Future<Output = ()>>,
+    ) -> impl Future<Output = ()> {
+        let end = now() + limit_ms.millis();
+        poll_fn(move |context| {
+            if work.as_mut().poll(context).is_ready() || now() >= end {
+                Poll::Ready(())
+            } else {
+                Poll::Pending
+            }
+        })
+    }
 }
 
-/// Does `work`, which waits by [`pause`] alone. Pinned by the caller, as below: taken by value it would be held twice.
-pub async fn paced(mut work: Pin<&mut impl Future<Output = Infallible>>) {
+/// Does `work`, which waits by the [`Pace`] that it is given alone.
+pub async fn paced(work: impl AsyncFnOnce(Pace<'_>) -> Infallible) {
+    let mut work = pin!(work(Pace(PhantomData)));
     loop {
         poll_fn(|context| {
             let _ = work.as_mut().poll(context);
@@ -90,19 +126,4 @@ pub async fn paced(mut work: Pin<&mut impl Future<Output = Infallible>>) {
             ms => until(now() + ms.millis()).await,
         }
     }
-}
-
-/// Within [`paced`]: `work`, unless it has not ended `limit_ms` from now.
-pub fn limited(
-    limit_ms: u32,
-    mut work: Pin<&mut impl Future<Output = ()>>,
-) -> impl Future<Output = ()> {
-    let end = now() + limit_ms.millis();
-    poll_fn(move |context| {
-        if work.as_mut().poll(context).is_ready() || now() >= end {
-            Poll::Ready(())
-        } else {
-            Poll::Pending
-        }
-    })
 }

@@ -32,6 +32,7 @@ use stm32f4xx_hal::{
 use crate::{
     flash,
     flash::{Flash, Lent},
+    pace::Pace,
     spi,
 };
 
@@ -130,8 +131,8 @@ impl Storage {
     }
 
     /// One try to wake the chip; whether it answers. Without it nothing is read or written: one that has gone reads as blank.
-    pub async fn start(&mut self) -> bool {
-        let result = self.flash.start().await;
+    pub async fn start(&mut self, pace: Pace<'_>) -> bool {
+        let result = self.flash.start(pace).await;
         if let Err(error) = &result {
             defmt::debug!("flash: {}", error);
         }
@@ -145,8 +146,8 @@ impl Storage {
     }
 
     /// The stored configuration.
-    pub async fn configuration(&mut self) -> Stored<Configuration> {
-        match self.newest(CONFIGURATION).await {
+    pub async fn configuration(&mut self, pace: Pace<'_>) -> Stored<Configuration> {
+        match self.newest(pace, CONFIGURATION).await {
             Ok(Some((bytes, is_older))) => match configuration::decode(bytes) {
                 Ok(configuration) => Stored::read(configuration, is_older),
                 Err(error) => {
@@ -174,8 +175,8 @@ impl Storage {
     }
 
     /// The stored charge and state of charge.
-    pub async fn state(&mut self) -> Stored<RetainedState> {
-        match self.newest(STATE).await {
+    pub async fn state(&mut self, pace: Pace<'_>) -> Stored<RetainedState> {
+        match self.newest(pace, STATE).await {
             Ok(Some((bytes, is_older))) => match RetainedState::decode(bytes) {
                 Ok(state) => Stored::read(state, is_older),
                 Err(error) => {
@@ -190,11 +191,16 @@ impl Storage {
     }
 
     /// The region's newest intact record, and whether it is older than one that is not intact.
-    async fn newest(&mut self, region: Range<u32>) -> Result<Option<(&[u8], bool)>, ()> {
+    async fn newest(
+        &mut self,
+        pace: Pace<'_>,
+        region: Range<u32>,
+    ) -> Result<Option<(&[u8], bool)>, ()> {
         let (Ok(config), true) = (QueueConfig::try_new(region.clone()), self.ready) else {
             return Err(());
         };
-        let mut queue = QueueStorage::new(Lent(&mut self.flash), config, Cache::new_uncached());
+        let mut queue =
+            QueueStorage::new(Lent(&mut self.flash, pace), config, Cache::new_uncached());
         let mut length = None;
         let mut items = queue.iter().await.map_err(|error| log(&error))?;
         // A record that is damaged or was cut off by a loss of power has a wrong CRC: it is read, and passed over.
@@ -210,7 +216,7 @@ impl Storage {
         }
         // Nothing intact in a region that is not blank: there was a record once, and it is damaged.
         let end = region.end;
-        if length.is_none() && self.first_written(region).await < end {
+        if length.is_none() && self.first_written(pace, region).await < end {
             count(&mut self.counters.refused);
             self.failed = true;
             return Err(());
@@ -229,11 +235,16 @@ impl Storage {
     }
 
     /// The region's first sector that was written, or cannot be read; its end without one.
-    async fn first_written(&mut self, region: Range<u32>) -> u32 {
+    async fn first_written(&mut self, pace: Pace<'_>, region: Range<u32>) -> u32 {
         let mut at = region.start;
         while at < region.end {
             let mut mark = [0; 4];
-            if Lent(&mut self.flash).read(at, &mut mark).await.is_err() || mark != [0xFF; 4] {
+            if Lent(&mut self.flash, pace)
+                .read(at, &mut mark)
+                .await
+                .is_err()
+                || mark != [0xFF; 4]
+            {
                 break;
             }
             at += SECTOR;
@@ -245,24 +256,34 @@ impl Storage {
     /// returns the future of the writing alone, which both then share.
     pub fn save_configuration(
         &mut self,
+        pace: Pace<'_>,
         configuration: &Configuration,
     ) -> impl Future<Output = Result<bool, ()>> {
         let record = configuration::encode(configuration, &mut self.record);
         let length = record.ok().map(<[u8]>::len);
-        self.push(CONFIGURATION, length)
+        self.push(pace, CONFIGURATION, length)
     }
 
     /// Writes charge and state of charge; an error if they are not in the flash then.
-    pub fn save_state(&mut self, state: &RetainedState) -> impl Future<Output = Result<bool, ()>> {
+    pub fn save_state(
+        &mut self,
+        pace: Pace<'_>,
+        state: &RetainedState,
+    ) -> impl Future<Output = Result<bool, ()>> {
         let buffer = self.record.get_mut(..MAX_STATE_BYTES);
         let record = buffer.and_then(|buffer| state.encode(buffer).ok());
         let length = record.map(<[u8]>::len);
-        self.push(STATE, length)
+        self.push(pace, STATE, length)
     }
 
     /// Writes the first `length` bytes of `record`, if it could be encoded; whether the oldest sector had to be given up for
     /// it.
-    async fn push(&mut self, region: Range<u32>, length: Option<usize>) -> Result<bool, ()> {
+    async fn push(
+        &mut self,
+        pace: Pace<'_>,
+        region: Range<u32>,
+        length: Option<usize>,
+    ) -> Result<bool, ()> {
         let length = length.ok_or(())?;
         let (Some(record), Ok(config), true) = (
             self.record.get(..length),
@@ -272,7 +293,8 @@ impl Storage {
             self.failed = true;
             return Err(());
         };
-        let mut queue = QueueStorage::new(Lent(&mut self.flash), config, Cache::new_uncached());
+        let mut queue =
+            QueueStorage::new(Lent(&mut self.flash, pace), config, Cache::new_uncached());
         let mut full = false;
         let result = loop {
             let result = queue.push(record, full).await;
@@ -296,13 +318,13 @@ impl Storage {
     }
 
     /// Appends to the log, over its oldest records when it is full.
-    pub async fn append(&mut self, record: &LogRecord) {
+    pub async fn append(&mut self, pace: Pace<'_>, record: &LogRecord) {
         let length = self
             .record
             .get_mut(..MAX_LOG_BYTES)
             .and_then(|buffer| record.encode(buffer).ok())
             .map(<[u8]>::len);
-        match self.push(LOG, length).await {
+        match self.push(pace, LOG, length).await {
             Ok(full) => {
                 self.overwrites |= full && !self.log_full;
                 self.log_full |= full;
@@ -313,15 +335,15 @@ impl Storage {
 
     /// Erases the log's next sector that was written, 45 ms, at most 400 ms; whether there may be another one. All of
     /// them in one go would take 23 s and more, in which no charge is saved.
-    pub async fn clear_log_sector(&mut self) -> Result<bool, ()> {
+    pub async fn clear_log_sector(&mut self, pace: Pace<'_>) -> Result<bool, ()> {
         // On from the last one, for a worn sector may never look blank.
         let from = core::mem::replace(&mut self.cleared, LOG.start);
-        let at = self.first_written(from..LOG.end).await;
+        let at = self.first_written(pace, from..LOG.end).await;
         if at >= LOG.end {
             self.log_full = false;
             return Ok(false);
         }
-        if let Err(error) = Lent(&mut self.flash).erase(at, at + SECTOR).await {
+        if let Err(error) = Lent(&mut self.flash, pace).erase(at, at + SECTOR).await {
             defmt::error!("flash: {}", error);
             count(&mut self.counters.failures);
             self.failed = true;
