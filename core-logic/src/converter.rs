@@ -286,7 +286,7 @@ pub struct Corrections {
 
 /// Bits behind the binary point of the folded coefficients: the slope's rounding costs 6·10⁻⁵ µA over all codes of
 /// the ADS1100 and 0.01 µA over ADC1's 4.2 V, and ±8,589 A still fit.
-const FRACTION_BITS: u32 = 28;
+pub const FRACTION_BITS: u32 = 28;
 /// Bits behind the binary point while folding: 5 V in nV then fit 63 bits, so that no division needs 128.
 const FOLDING_BITS: u32 = 30;
 /// Largest |slope · input| and |offset|, so that their sum cannot overflow: 2^(61 − 28) µA.
@@ -372,6 +372,12 @@ impl ConverterCoefficients {
     #[must_use]
     pub const fn step(&self, range: Range) -> Microamps {
         Microamps(evaluate(self.ranges.of(range).slope, 0, 1))
+    }
+
+    /// µA per unit of input, with [`FRACTION_BITS`].
+    #[must_use]
+    pub const fn slope(&self, range: Range) -> i64 {
+        self.ranges.of(range).slope
     }
 
     /// The converter whose samples these coefficients are for.

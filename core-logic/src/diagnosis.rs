@@ -214,8 +214,8 @@ diagnoses! {
     32 ConfigurationDefault: "The stored configuration was refused, or none was there for a lost one; defaults are in use.",
         "CRC, version or limits of the configuration record";
         0 ms, 0 ms, Error, UntilCleared, [] [] []
-    33 ConfigurationCorruptRam: "The configuration in RAM failed its check; nothing is valid until the stored one, or without one the defaults, are in use.",
-        "CRC once a second";
+    33 ConfigurationCorruptRam: "The configuration in RAM or a factor worked out from it failed its check; nothing is valid until both are right, from the stored one or without one the defaults.",
+        "CRC and comparison once a second";
         0 ms, 1000 ms, Critical, UntilCleared, [IMPLAUSIBLE] [IMPLAUSIBLE] [IMPLAUSIBLE]
     34 LogFull: "The log is full: every new record replaces the oldest.",
         "oldest record replaced";

@@ -8,7 +8,8 @@
 //! ```
 //!
 //! It belongs to one owner (the firmware's priority-2 task) and never blocks. The configuration is not part of it: the
-//! caller hands in the active one, and tells by [`Measurement::configuration_changed`] when it is another one.
+//! caller hands in the active one, tells by [`Measurement::configuration_changed`] when it is another one, and has the
+//! factors that follow from it checked by [`Measurement::check_factors`].
 //!
 //! **The meter hangs on the same sensor.** What is known about the sensor (zero drift, key-state factors, supply) holds
 //! for the charge as well as for the current: [`effective_meter_config`] works it into the meter's scale and offset.
@@ -231,13 +232,30 @@ const START_UP: Duration = Duration::from_ticks(500_000);
 /// Above this the state of charge is reported as uncertain: a tenth of the capacity.
 pub const SOC_UNCERTAINTY_LIMIT: Ppm = Ppm(100_000);
 
-#[derive(Clone, Copy, Debug)]
-struct Prepared {
+/// What the factors follow from besides the configuration.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Basis {
+    factors: KeyFactors,
+    supply: Option<Microvolts>,
+    /// Tells it from those before.
+    number: u32,
+}
+
+/// The configuration worked into factors.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Prepared {
     converter: ConverterCoefficients,
     open_sensor: OpenSensorThresholds,
     soc: SocCoefficients,
     /// The supply that went into it.
     supply: Option<Microvolts>,
+}
+
+impl Prepared {
+    #[inline(never)]
+    fn is(&self, other: &Self) -> bool {
+        self == other
+    }
 }
 
 /// The composition's state.
@@ -266,8 +284,10 @@ pub struct Measurement {
     /// As much of the charge's doubt as the state of charge has in its own.
     doubted: Nanocoulombs,
     meter_causes: Validity,
-    /// [`Measurement::meter_config`] is another one since it was taken.
-    meter_calibration_changed: bool,
+    /// Of the [`Basis`] and the configuration that the factors are worked out of: counts their changes, from 1.
+    basis_number: u32,
+    /// [`Measurement::meter_config`] is to be handed to the meter's owner.
+    meter_calibration_due: bool,
     zero: ZeroCalibration,
     zero_beyond_limit: bool,
     key: KeyCalibration,
@@ -382,11 +402,13 @@ pub fn effective_meter_config(
     meter
 }
 
-fn prepare(
-    configuration: &Configuration,
-    factors: KeyFactors,
-    supply: Option<Microvolts>,
-) -> Prepared {
+/// Works the factors out: 25,000 instructions, to be done where nobody waits.
+#[must_use]
+#[inline(never)]
+pub fn prepare(configuration: &Configuration, basis: &Basis) -> Prepared {
+    let &Basis {
+        factors, supply, ..
+    } = basis;
     let two_ranges = configuration.front_end.has_two_ranges();
     let corrections = Corrections {
         key_factors: PerRange {
@@ -447,7 +469,14 @@ impl Measurement {
         now: Instant,
     ) -> Self {
         let factors = retained.map_or(configuration.key_factors, |state| state.key_factors);
-        let prepared = prepare(configuration, factors, None);
+        let prepared = prepare(
+            configuration,
+            &Basis {
+                factors,
+                supply: None,
+                number: 1,
+            },
+        );
         let mut soc = retained.map_or_else(
             || Soc::new(&prepared.soc),
             |state| Soc::restore(&prepared.soc, &state.soc, state.charge_total),
@@ -477,7 +506,8 @@ impl Measurement {
             miscounted: Nanocoulombs::ZERO,
             doubted: Nanocoulombs::ZERO,
             meter_causes: Validity::STALE,
-            meter_calibration_changed: true,
+            basis_number: 1,
+            meter_calibration_due: true,
             zero: ZeroCalibration::new(),
             zero_beyond_limit: false,
             sweep: None,
@@ -543,13 +573,43 @@ impl Measurement {
         self.soc_reading = self.soc.reading(&self.prepared.soc);
     }
 
-    /// What the meter's owner has to count with, if that has changed since the last call.
-    pub fn changed_meter_calibration(
+    /// What the meter's owner has to count with, if that has changed or is to be checked since the last call.
+    pub fn due_meter_calibration(
         &mut self,
         configuration: &Configuration,
     ) -> Option<MeterCalibration> {
-        core::mem::take(&mut self.meter_calibration_changed)
-            .then(|| MeterCalibration::new(self.meter_config(configuration)))
+        core::mem::take(&mut self.meter_calibration_due)
+            .then(|| MeterCalibration::new(self.meter_config(configuration), self.basis_number))
+    }
+
+    /// What the factors follow from besides the configuration, for [`prepare`].
+    #[must_use]
+    pub const fn basis(&self) -> Basis {
+        Basis {
+            factors: self.key.factors(),
+            supply: self.prepared.supply,
+            number: self.basis_number,
+        }
+    }
+
+    /// Compares the factors in use with those that were worked out anew, of `basis` and a configuration that was just found
+    /// sound; whether they are others, as only damage makes them. They are replaced then. The meter's owner is handed its own
+    /// again, and finds their damage itself.
+    #[inline(never)]
+    pub fn check_factors(&mut self, basis: &Basis, prepared: &Prepared) -> bool {
+        self.meter_calibration_due = true;
+        // With another basis they have been worked out anew meanwhile.
+        if basis.number != self.basis_number || self.prepared.is(prepared) {
+            return false;
+        }
+        if self.prepared.soc != prepared.soc {
+            // What it has cut off or lost by them nobody knows.
+            self.soc.declare_loss(&prepared.soc, Nanocoulombs(i64::MAX));
+        }
+        self.prepared = *prepared;
+        self.average.clear();
+        self.compare.restart_at(self.now);
+        true
     }
 
     fn prepare_again(
@@ -559,8 +619,16 @@ impl Measurement {
         supply: Option<Microvolts>,
         now: Instant,
     ) {
-        self.prepared = prepare(configuration, factors, supply);
-        self.meter_calibration_changed = true;
+        self.basis_number = self.basis_number.wrapping_add(1);
+        self.prepared = prepare(
+            configuration,
+            &Basis {
+                factors,
+                supply,
+                number: self.basis_number,
+            },
+        );
+        self.meter_calibration_due = true;
         self.converter.forget_meter_until(meter_follows(now));
     }
 
@@ -654,6 +722,13 @@ impl Measurement {
         if report.at.is_none() {
             // Nothing was read since the start, and perhaps the counter not even handed over: what is known stands.
             report.charge_total = self.meter.charge_total;
+        }
+        if report.damaged != self.meter.damaged {
+            // Its charge was taken back: no current has flowed, and what an end of the battery's range has cut off is not had
+            // back.
+            let taken_back = report.charge_total.saturating_sub(self.meter.charge_total);
+            self.soc.declare_loss(&self.prepared.soc, taken_back);
+            self.compare.restart_at(self.now);
         }
         self.meter = report;
         self.gap.begin_at(report.at.unwrap_or(self.started));
@@ -1509,4 +1584,91 @@ fn hall_voltage(network: Microvolts) -> Microvolts {
 fn percent(taken: u16, of: u16) -> u16 {
     let share = u32::from(taken) * 100 / u32::from(of.max(1));
     u16::try_from(share.min(100)).unwrap_or(100)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    fn at(us: u64) -> Instant {
+        Instant::from_ticks(us)
+    }
+
+    /// F22.
+    #[test]
+    fn damaged_factors_are_found_and_replaced() {
+        let configuration = Configuration::default();
+        let mut sound = Measurement::new(&configuration, None, Nanocoulombs::ZERO, at(0));
+        sound.set_state_of_charge(Ppm(500_000), Ppm(10_000));
+        let flips: [fn(&mut Prepared); 5] = [
+            |p| p.converter = damaged_converter(),
+            |p| p.open_sensor.open_below.0 ^= 1 << 20,
+            |p| p.open_sensor.converter.as_mut().unwrap().large.high.0 ^= 1,
+            |p| p.soc = damaged_soc(),
+            |p| p.supply = Some(Microvolts(1 << 22)),
+        ];
+        for (number, flip) in flips.into_iter().enumerate() {
+            let mut measurement = sound;
+            let basis = measurement.basis();
+            let prepared = prepare(&configuration, &basis);
+            assert!(!measurement.check_factors(&basis, &prepared), "{number}");
+            flip(&mut measurement.prepared);
+            assert!(measurement.check_factors(&basis, &prepared), "{number}");
+            assert_eq!(measurement.prepared, sound.prepared, "{number}");
+            assert!(!measurement.check_factors(&basis, &prepared), "{number}");
+            // What the state of charge has lost by them nobody knows.
+            let uncertainty = measurement
+                .soc
+                .reading(&measurement.prepared.soc)
+                .uncertainty;
+            assert_eq!(uncertainty == Ppm::ONE, number == 3, "{number}");
+        }
+    }
+
+    fn damaged_converter() -> ConverterCoefficients {
+        let mut configuration = Configuration::default();
+        configuration.converter.saturation_margin.0 ^= 1 << 8;
+        prepare(&configuration, &NOMINAL).converter
+    }
+
+    fn damaged_soc() -> SocCoefficients {
+        let mut configuration = Configuration::default();
+        configuration.soc.capacity_mah ^= 1 << 8;
+        SocCoefficients::new(&configuration.soc)
+    }
+
+    const NOMINAL: Basis = Basis {
+        factors: KeyFactors::NONE,
+        supply: None,
+        number: 1,
+    };
+
+    /// Between the look at the basis and the comparison the supply has moved: no damage.
+    #[test]
+    fn factors_that_were_worked_out_anew_meanwhile_are_no_damage() {
+        let configuration = Configuration::default();
+        let mut measurement = Measurement::new(&configuration, None, Nanocoulombs::ZERO, at(0));
+        let basis = measurement.basis();
+        let prepared = prepare(&configuration, &basis);
+        measurement.average_supply(&configuration, Some(Microvolts(4_900_000)), at(10_000));
+        assert!(!measurement.check_factors(&basis, &prepared));
+        assert_eq!(measurement.prepared.supply, Some(Microvolts(4_900_000)));
+    }
+
+    /// The meter's factors are handed over again at each check, by the same number; by another one after a change.
+    #[test]
+    fn the_meter_is_handed_its_factors_at_each_check() {
+        let configuration = Configuration::default();
+        let mut measurement = Measurement::new(&configuration, None, Nanocoulombs::ZERO, at(0));
+        let first = measurement.due_meter_calibration(&configuration).unwrap();
+        assert_eq!(measurement.due_meter_calibration(&configuration), None);
+        let basis = measurement.basis();
+        measurement.check_factors(&basis, &prepare(&configuration, &basis));
+        let again = measurement.due_meter_calibration(&configuration);
+        assert_eq!(again, Some(first));
+        measurement.configuration_changed(&configuration);
+        let changed = measurement.due_meter_calibration(&configuration).unwrap();
+        assert_ne!(changed, first);
+    }
 }

@@ -292,6 +292,8 @@ pub struct MeterReport {
     pub estimated_intervals: u32,
     /// Gaps that were bridged.
     pub gaps: u32,
+    /// Times the factors were found damaged, and what was counted by them was counted anew.
+    pub damaged: u32,
     /// Bound of the error that hand-overs, estimates and gaps can have made since the start: their worst cases, added.
     /// Sensor, reference and the other errors proportional to the reading are not in it (`error_budget`).
     pub uncertainty: Nanocoulombs,
@@ -315,6 +317,7 @@ impl Default for MeterReport {
             hand_overs: 0,
             estimated_intervals: 0,
             gaps: 0,
+            damaged: 0,
             uncertainty: Nanocoulombs::ZERO,
         }
     }
@@ -420,16 +423,24 @@ impl Coefficients {
 pub struct MeterCalibration {
     config: MeterConfig,
     coefficients: Coefficients,
+    number: u32,
 }
 
 impl MeterCalibration {
-    /// Works the factors out.
+    /// Works the factors out. `number` tells this calibration from others: two of the same one are equal.
     #[must_use]
-    pub fn new(config: MeterConfig) -> Self {
+    pub fn new(config: MeterConfig, number: u32) -> Self {
         Self {
             config,
             coefficients: Coefficients::new(&config),
+            number,
         }
+    }
+
+    /// Charge of one count in `range`, in units of 2⁻²⁴ pC.
+    #[must_use]
+    pub const fn scale(&self, range: Range) -> i64 {
+        *self.coefficients.scale.of(range)
     }
 }
 
@@ -484,9 +495,11 @@ struct Booked {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct MeterChannel {
-    config: MeterConfig,
-    coefficients: Coefficients,
+    /// The newest one; number 0 before the first.
+    calibration: MeterCalibration,
     booked: Booked,
+    /// The same and the uncertainty at the newest calibration: counted by factors that were sound.
+    sound: (Booked, Accumulator),
     /// As it was before the newest reading, should that one turn out to be wrong.
     before: Option<Booked>,
     uncertainty: Accumulator,
@@ -507,25 +520,27 @@ pub struct MeterChannel {
     hand_overs: u32,
     estimated_intervals: u32,
     gaps: u32,
+    damaged: u32,
 }
 
 impl MeterChannel {
     /// Nothing counted yet.
     #[must_use]
     pub fn new(config: MeterConfig) -> Self {
+        let booked = Booked {
+            last: None,
+            total: Accumulator::default(),
+            input: Accumulator::default(),
+            output: Accumulator::default(),
+            sign: 0,
+            sign_at: Instant::from_ticks(0),
+            pending: 0,
+            last_scale: 0,
+        };
         Self {
-            coefficients: Coefficients::new(&config),
-            config,
-            booked: Booked {
-                last: None,
-                total: Accumulator::default(),
-                input: Accumulator::default(),
-                output: Accumulator::default(),
-                sign: 0,
-                sign_at: Instant::from_ticks(0),
-                pending: 0,
-                last_scale: 0,
-            },
+            calibration: MeterCalibration::new(config, 0),
+            booked,
+            sound: (booked, Accumulator::default()),
             before: None,
             uncertainty: Accumulator::default(),
             bridged: None,
@@ -541,28 +556,61 @@ impl MeterChannel {
             hand_overs: 0,
             estimated_intervals: 0,
             gaps: 0,
+            damaged: 0,
         }
     }
 
     /// Another calibration: counts after the last reading are taken by it. Charge and remainder stay as they are.
-    pub fn set_calibration(&mut self, calibration: MeterCalibration) {
-        let MeterCalibration {
-            config,
-            coefficients,
-        } = calibration;
-        self.config = config;
-        self.coefficients = coefficients;
+    ///
+    /// The same one again: the factors in use have to be its factors. If they are not, they are damaged, and the counts since
+    /// the last time are taken again.
+    pub fn set_calibration(&mut self, calibration: &MeterCalibration) {
+        let is_damaged =
+            calibration.number == self.calibration.number && *calibration != self.calibration;
+        self.calibration = *calibration;
+        if is_damaged {
+            self.damaged = self.damaged.saturating_add(1);
+            self.count_again();
+        }
+        self.note_sound();
     }
 
     /// As [`MeterChannel::set_calibration`], with the factors worked out here.
     pub fn set_config(&mut self, config: MeterConfig) {
-        self.set_calibration(MeterCalibration::new(config));
+        self.set_calibration(&MeterCalibration::new(
+            config,
+            self.calibration.number.wrapping_add(1),
+        ));
+    }
+
+    #[inline(never)]
+    fn note_sound(&mut self) {
+        self.sound = (self.booked, self.uncertainty);
+    }
+
+    /// The counts from [`MeterChannel::note_sound`] to the newest reading, in one interval: by the shares of the ranges if
+    /// there were edges.
+    #[inline(never)]
+    fn count_again(&mut self) {
+        let newest = self.booked.last;
+        (self.booked, self.uncertainty) = self.sound;
+        self.before = None;
+        self.mean_over = Duration::from_ticks(0);
+        if let Some((reading, history)) = newest
+            && let Some((last, earlier)) = self.booked.last
+            && let Some(counts) = plausible_counts(&last, &reading)
+        {
+            self.window = Some((last.at, self.booked.total));
+            let interval = history.since(&earlier);
+            self.waited |= interval.edges != 0;
+            self.integrate(counts, &interval, reading, history);
+        }
     }
 
     /// The configuration in use.
     #[must_use]
     pub const fn config(&self) -> &MeterConfig {
-        &self.config
+        &self.calibration.config
     }
 
     /// Sets the counters to values kept over a reset. What was summed before is replaced.
@@ -577,6 +625,7 @@ impl MeterChannel {
         self.booked.output = Accumulator::at(charge_out);
         self.before = None;
         self.window = None;
+        self.note_sound();
     }
 
     /// The board has started at `at`: what flows before the first reading is a gap if that comes late.
@@ -627,13 +676,14 @@ impl MeterChannel {
             self.consecutive_rejections = 0;
             self.booked = before;
             self.window = None;
+            self.note_sound();
             return self.integrate(counts, &history.since(&earlier), reading, history);
         }
         refused
     }
 
     fn short_interval(&self) -> Duration {
-        Duration::from_ticks(u64::from(self.config.short_interval_us))
+        Duration::from_ticks(u64::from(self.calibration.config.short_interval_us))
     }
 
     /// Whether edges were missed or follow each other so fast that a count is too coarse for the stays between them.
@@ -720,16 +770,16 @@ impl MeterChannel {
         let holds = elapsed(bridge.until, reading.at) <= bridge.holds;
         let error = if holds {
             self.bridged = Some((tail, current));
-            converter_error(&self.config, current)
+            converter_error(&self.calibration.config, current)
         } else {
             self.bridged = None;
             let stays_small = self.booked.last.is_some_and(|(_, earlier)| {
                 earlier.edges == history.edges && history.range == Range::Small
             });
             let full_scale = if stays_small {
-                self.config.full_scale.small
+                self.calibration.config.full_scale.small
             } else {
-                self.config.full_scale.large
+                self.calibration.config.full_scale.large
             };
             full_scale
                 .saturating_abs()
@@ -747,6 +797,7 @@ impl MeterChannel {
         self.before = None;
         self.booked.last = Some((reading, history));
         self.update_mean(reading.at);
+        self.note_sound();
     }
 
     /// Everything counted so far.
@@ -768,17 +819,21 @@ impl MeterChannel {
             charge_total: self.booked.total.rounded(),
             charge_in: self.booked.input.rounded(),
             charge_out: self.booked.output.rounded(),
-            resolution: Nanocoulombs(div_round(self.coefficients.scale.get(range), NANOCOULOMB)),
+            resolution: Nanocoulombs(div_round(
+                self.calibration.coefficients.scale.get(range),
+                NANOCOULOMB,
+            )),
             mean_current: self.mean_current,
             mean_over: self.mean_over,
             mean_begun: self.mean_begun,
             below_no_load: !self.mean_over.is_zero()
-                && magnitude < self.config.no_load_current(range),
+                && magnitude < self.calibration.config.no_load_current(range),
             lost: self.lost,
             rejected: self.rejected,
             hand_overs: self.hand_overs,
             estimated_intervals: self.estimated_intervals,
             gaps: self.gaps,
+            damaged: self.damaged,
             // Rounded up, with the rounding of the total itself.
             uncertainty: Nanocoulombs(add_i64(uncertainty.whole, 2)),
         }
@@ -793,6 +848,7 @@ impl MeterChannel {
     fn begin(&mut self, reading: MeterReading, history: RangeHistory) {
         self.booked.last = Some((reading, history));
         self.window = Some((reading.at, self.booked.total));
+        self.note_sound();
     }
 
     fn reject(&mut self, reason: Rejection) -> ReadingOutcome {
@@ -816,7 +872,7 @@ impl MeterChannel {
         } else if self.booked.pending != 0 {
             self.settle_pending(counts);
         }
-        self.change_scale(self.coefficients.scale.get(range));
+        self.change_scale(self.calibration.coefficients.scale.get(range));
         self.book(self.counted_charge(counts, range) - self.offset_charge(interval));
         ReadingOutcome::Integrated
     }
@@ -833,11 +889,11 @@ impl MeterChannel {
         let long = short.other();
         let estimated = interval.time_in(short);
         self.sign_in(counts, interval, now);
-        self.change_scale(self.coefficients.scale.get(long));
+        self.change_scale(self.calibration.coefficients.scale.get(long));
 
         let mut correction = self.misscaled(estimated, short);
         // For its delay after an edge the filter still passes the old range.
-        let delay = Duration::from_ticks(u64::from(self.config.front_end_delay_us));
+        let delay = Duration::from_ticks(u64::from(self.calibration.config.front_end_delay_us));
         if interval.first == short {
             correction += self.misscaled(delay, short);
         }
@@ -855,9 +911,10 @@ impl MeterChannel {
         }
         self.hand_overs = self.hand_overs.saturating_add(interval.edges);
 
-        let switching_current = self.config.switching_current.saturating_abs();
+        let switching_current = self.calibration.config.switching_current.saturating_abs();
         // The estimated part cannot be further off than its sensor's range allows.
         let span = self
+            .calibration
             .config
             .full_scale
             .get(short)
@@ -868,14 +925,19 @@ impl MeterChannel {
         );
         let doubt = add_i128(
             add_i128(
-                charge_of(self.config.switching_tolerance.saturating_abs(), estimated),
+                charge_of(
+                    self.calibration.config.switching_tolerance.saturating_abs(),
+                    estimated,
+                ),
                 self.slew_charge(estimated),
             )
             .min(charge_of(span, estimated)),
             charge_of(switching_current, stamps),
         );
-        self.uncertainty
-            .add(times(doubt, abs_i64(self.coefficients.step.get(short))));
+        self.uncertainty.add(times(
+            doubt,
+            abs_i64(self.calibration.coefficients.step.get(short)),
+        ));
         if interval.edges == 1 && estimated.as_ticks() <= 2 * design::SNAPSHOT_DEADLINE_US {
             ReadingOutcome::Integrated
         } else {
@@ -888,8 +950,8 @@ impl MeterChannel {
     fn by_time_shares(&mut self, counts: i32, interval: &RangeInterval) -> ReadingOutcome {
         self.settle_pending(counts);
         self.booked.sign = 0;
-        let excess = self.coefficients.excess(interval);
-        let small = self.coefficients.scale.small;
+        let excess = self.calibration.coefficients.excess(interval);
+        let small = self.calibration.coefficients.scale.small;
         let scale = clamp_i64(add_i128(
             i128::from(small),
             times(i128::from(small), excess),
@@ -905,8 +967,8 @@ impl MeterChannel {
     /// What is wrong with the counts that the switching current makes in `range` when they are taken by the other scale.
     fn misscaled(&self, time: Duration, range: Range) -> i128 {
         times(
-            charge_of(self.config.switching_current, time),
-            self.coefficients.step.get(range),
+            charge_of(self.calibration.config.switching_current, time),
+            self.calibration.coefficients.step.get(range),
         )
     }
 
@@ -914,10 +976,10 @@ impl MeterChannel {
     #[inline(never)]
     fn offset_charge(&self, interval: &RangeInterval) -> i128 {
         charge_of(
-            self.config.offset.small,
+            self.calibration.config.offset.small,
             interval.small.min(LONGEST_INTERVAL),
         ) + charge_of(
-            self.config.offset.large,
+            self.calibration.config.offset.large,
             interval.large.min(LONGEST_INTERVAL),
         )
     }
@@ -927,14 +989,21 @@ impl MeterChannel {
     /// beyond the sensor's end.
     fn doubt_small_sensor(&mut self, counts: i32, shared: bool, interval: &RangeInterval) {
         let time = interval.length().min(LONGEST_INTERVAL);
-        let PerRange { small, large } = self.config.full_scale;
+        let PerRange { small, large } = self.calibration.config.full_scale;
         let counted = abs_i128(mul_wide(i64::from(counts), self.booked.last_scale));
         let beyond = |current: Microamps| sub_i128(counted, charge_of(current, time)).max(0);
         let doubt = if shared {
-            self.coefficients
+            self.calibration
+                .coefficients
                 .hidden_by_small_sensor(beyond(small), interval)
         } else if interval.shorter() == Range::Large {
-            let between = self.config.switching_current.saturating_add(small).get() / 2;
+            let between = self
+                .calibration
+                .config
+                .switching_current
+                .saturating_add(small)
+                .get()
+                / 2;
             if beyond(Microamps(between)) <= i128::from(self.booked.last_scale) {
                 return;
             }
@@ -950,15 +1019,21 @@ impl MeterChannel {
     /// height t_small · (w_small − 1), so the error is at most half the slew over the interval times that height. Besides,
     /// the times may be wrong by a stamp, and by what the filter in front remembers.
     fn shares_doubt(&self, excess: i64, interval: &RangeInterval) -> i128 {
-        let slew = u64::from(self.config.slew_limit_amps_per_second)
+        let slew = u64::from(self.calibration.config.slew_limit_amps_per_second)
             .saturating_mul(interval.length().as_ticks())
             / 2;
         // No further than from one end of the large range to the other.
-        let full = self.config.full_scale.large.saturating_abs().get();
+        let full = self
+            .calibration
+            .config
+            .full_scale
+            .large
+            .saturating_abs()
+            .get();
         let span = clamp_i32(clamp_i64(i128::from(slew).min(2 * i128::from(full))));
         let of_shape = times(charge_of(Microamps(span), interval.small), abs_i64(excess));
-        let misjudged =
-            u64::from(self.config.front_end_delay_us).saturating_add(design::EDGE_STAMP_DELAY_US);
+        let misjudged = u64::from(self.calibration.config.front_end_delay_us)
+            .saturating_add(design::EDGE_STAMP_DELAY_US);
         let of_times = abs_i128(self.misscaled(Duration::from_ticks(misjudged), Range::Small));
         add_i128(of_shape, of_times)
     }
@@ -968,13 +1043,16 @@ impl MeterChannel {
         // (7.8·10⁸ µs)² is below 2⁶⁰.
         let ticks = time.min(LONGEST_INTERVAL).as_ticks().cast_signed();
         mul_wide(
-            i64::from(self.config.slew_limit_amps_per_second),
+            i64::from(self.calibration.config.slew_limit_amps_per_second),
             ticks * ticks,
         ) << (FRACTION_BITS - 1)
     }
 
     fn counted_charge(&self, counts: i32, range: Range) -> i128 {
-        mul_wide(i64::from(counts), self.coefficients.scale.get(range))
+        mul_wide(
+            i64::from(counts),
+            self.calibration.coefficients.scale.get(range),
+        )
     }
 
     /// `charge`, which is as for a positive current, by the known sign.
@@ -1046,9 +1124,14 @@ impl MeterChannel {
             }
         } else {
             // µA by A/s is µs.
-            let switching = self.config.switching_current.saturating_abs().get();
+            let switching = self
+                .calibration
+                .config
+                .switching_current
+                .saturating_abs()
+                .get();
             let reversal = u64::from(switching.unsigned_abs()) * 2
-                / u64::from(self.config.slew_limit_amps_per_second.max(1));
+                / u64::from(self.calibration.config.slew_limit_amps_per_second.max(1));
             if elapsed(self.booked.sign_at, now).as_ticks() >= reversal {
                 self.settle_pending(counts);
                 self.booked.sign = 0;
@@ -1085,7 +1168,7 @@ impl MeterChannel {
     fn update_mean(&mut self, now: Instant) {
         let (begin, charge) = *self.window.get_or_insert((now, self.booked.total));
         let length = elapsed(begin, now);
-        if length < milliseconds(self.config.mean_window_ms) || length.is_zero() {
+        if length < milliseconds(self.calibration.config.mean_window_ms) || length.is_zero() {
             return;
         }
         self.mean_current = self.mean_since(charge, length);
@@ -1187,6 +1270,117 @@ mod tests {
             (value - expected).abs() <= tolerance,
             "{value} instead of {expected}"
         );
+    }
+
+    /// F22, with edges in the time that is counted again and without.
+    #[test]
+    fn damaged_factors_are_found_and_their_counts_are_taken_again() {
+        let flips: [fn(&mut MeterCalibration); 8] = [
+            |c| c.coefficients.scale.small ^= 1 << 54,
+            |c| c.coefficients.scale.large ^= 1 << 62,
+            |c| c.coefficients.step.small ^= 1 << 33,
+            |c| c.coefficients.step.large ^= 1 << 30,
+            |c| c.config.offset.small.0 ^= 1 << 30,
+            |c| c.config.full_scale.small.0 ^= 1 << 25,
+            |c| c.config.switching_current.0 ^= 1 << 29,
+            |c| c.config.mean_window_ms ^= 1 << 4,
+        ];
+        for has_edges in [false, true] {
+            for (number, flip) in flips.into_iter().enumerate() {
+                let calibration = MeterCalibration::new(MeterConfig::default(), 7);
+                let run = |flip: Option<fn(&mut MeterCalibration)>| {
+                    let mut bench = Bench::new(MeterConfig::default(), Range::Small);
+                    bench.channel.set_calibration(&calibration);
+                    let mut range = Range::Small;
+                    for step in 1..=200 {
+                        let us = step * 20_000;
+                        if has_edges && step % 25 == 0 {
+                            range = range.other();
+                            bench.edge(us - 9_000, range);
+                        }
+                        // 53 A by what each range makes of them.
+                        let counts = if range == Range::Small { 158 } else { 16 };
+                        bench.read(us, counts);
+                        if step == 60
+                            && let Some(flip) = flip
+                        {
+                            flip(&mut bench.channel.calibration);
+                        }
+                        if step % 50 == 0 {
+                            bench.channel.set_calibration(&calibration);
+                        }
+                    }
+                    bench
+                };
+                let (sound, damaged) = (run(None), run(Some(flip)));
+                let (expected, report) = (sound.channel.report(), damaged.channel.report());
+                assert_eq!((expected.damaged, report.damaged), (0, 1), "{number}");
+                if has_edges {
+                    // By shares of a second, in which the current might have been any.
+                    near(damaged.coulombs(), sound.coulombs(), 6.0);
+                    assert!(damaged.doubt() <= sound.doubt() + 600.0);
+                } else {
+                    assert_eq!(
+                        MeterReport {
+                            damaged: 0,
+                            ..report
+                        },
+                        expected,
+                        "{number}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_same_calibration_again_changes_nothing_and_another_one_is_no_damage() {
+        let mut bench = Bench::new(MeterConfig::default(), Range::Small);
+        let first = MeterCalibration::new(MeterConfig::default(), 1);
+        bench.channel.set_calibration(&first);
+        bench.read(20_000, 150);
+        let before = bench.channel.report();
+        bench.channel.set_calibration(&first);
+        assert_eq!(bench.channel.report(), before);
+        let mut config = MeterConfig::default();
+        config.gain.small = Ppm(10_000);
+        bench
+            .channel
+            .set_calibration(&MeterCalibration::new(config, 2));
+        let report = bench.channel.report();
+        assert_eq!(
+            (report.charge_total, report.uncertainty),
+            (before.charge_total, before.uncertainty)
+        );
+        bench.read(40_000, 150);
+        assert_eq!(bench.channel.report().damaged, 0);
+    }
+
+    /// What was undone before, by the readings, is not had back from what was noted meanwhile.
+    #[test]
+    fn damage_after_a_disturbed_reading_that_was_undone_costs_nothing() {
+        let calibration = MeterCalibration::new(MeterConfig::default(), 1);
+        let mut bench = Bench::new(MeterConfig::default(), Range::Small);
+        bench.read(20_000, 150);
+        let truth = bench.energy + 300;
+        bench.channel.on_reading(
+            MeterReading {
+                energy: bench.energy + 150 + 400,
+                at: at(40_000),
+            },
+            bench.recorder.history(at(40_000)),
+        );
+        bench.channel.set_calibration(&calibration);
+        bench.energy = truth;
+        for us in [60_000, 60_100, 60_200] {
+            bench.read(us, 0);
+        }
+        near(bench.coulombs(), 450.0 * per_count(Range::Small), 1e-8);
+        bench.channel.calibration.coefficients.scale.small ^= 1 << 54;
+        bench.read(80_000, 150);
+        bench.channel.set_calibration(&calibration);
+        near(bench.coulombs(), 600.0 * per_count(Range::Small), 1e-8);
+        assert_eq!(bench.channel.report().damaged, 1);
     }
 
     #[test]

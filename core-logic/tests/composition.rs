@@ -1113,13 +1113,13 @@ fn a_mean_that_moves_by_other_factors_makes_no_converter_stuck() {
     assert!(
         bench
             .measurement
-            .changed_meter_calibration(&bench.configuration)
+            .due_meter_calibration(&bench.configuration)
             .is_some()
     );
     assert_eq!(
         bench
             .measurement
-            .changed_meter_calibration(&bench.configuration),
+            .due_meter_calibration(&bench.configuration),
         None
     );
     // The meter has its new factors a poll later.

@@ -11,6 +11,12 @@ use plant::front_end::SensorFault;
 use plant::supply::SupplyProfile;
 
 use core_logic::configuration::Configuration;
+use core_logic::converter::{self, ConverterCoefficients, Corrections};
+use core_logic::meter::MeterCalibration;
+use core_logic::open_sensor::OpenSensorThresholds;
+use core_logic::range::Range;
+use core_logic::soc::{RECIPROCAL_PLACES, SocCoefficients};
+use core_logic::units::Ppm;
 
 use crate::board::{Board, LineFault};
 use crate::can_bus;
@@ -132,8 +138,8 @@ pub const CATALOGUE: [Entry; 24] = [
     entry("F21", "the supply fails and comes back", "none"),
     entry(
         "F22",
-        "a bit of the configuration flips in RAM",
-        "number of its copy in RAM; all without it",
+        "a bit of the configuration flips in RAM, or of what is worked out from it",
+        "number of its copy in RAM, all without it; or converter, meter, soc or sensor",
     ),
     entry(
         "F24",
@@ -301,6 +307,8 @@ pub enum Fault {
         /// Which of the copies in RAM, by address; `None`: all.
         copy: Option<usize>,
     },
+    /// F22.
+    FactorBitFlip(Factor),
     /// F24.
     Core(CoreFault),
     /// F25.
@@ -624,12 +632,22 @@ impl Fault {
             "F20" => Self::FlashWear,
             "F21" => Self::PowerLoss,
             "F22" => {
-                let copy = given.quantity(&PLAIN);
-                Self::ConfigurationBitFlip {
-                    copy: copy
-                        .map(|copy| given.checked(copy, 0.0, 99.0))
-                        .transpose()?
-                        .map(|copy| copy as usize),
+                let words = [
+                    ("converter", Factor::Converter),
+                    ("meter", Factor::Meter),
+                    ("soc", Factor::StateOfCharge),
+                    ("sensor", Factor::OpenSensor),
+                ];
+                if let Some(factor) = given.word(&words) {
+                    Self::FactorBitFlip(factor)
+                } else {
+                    let copy = given.quantity(&PLAIN);
+                    Self::ConfigurationBitFlip {
+                        copy: copy
+                            .map(|copy| given.checked(copy, 0.0, 99.0))
+                            .transpose()?
+                            .map(|copy| copy as usize),
+                    }
                 }
             }
             "F24" => Self::Core(
@@ -803,6 +821,13 @@ impl Fault {
                     }
                 }
             }
+            Self::FactorBitFlip(factor) => {
+                for (address, bit) in factors_in_ram(rig, factor) {
+                    if let Some(word) = rig.machine.ram_word(address) {
+                        rig.machine.set_ram_word(address, word ^ bit);
+                    }
+                }
+            }
             Self::Core(fault) => stop_core(rig, fault),
             Self::ZeroWhileDriving => rig.send_rs485(&with_crc(&ZERO_NOW)),
             Self::Together { length } => {
@@ -954,16 +979,111 @@ pub fn configurations_in_ram(rig: &Rig<'_>) -> Vec<u32> {
         .flat_map(|point| [point.soc.get(), point.voltage.get()])
         .map(i32::cast_unsigned)
         .collect();
+    find_in_ram(rig, wanted.len(), |window| *window == wanted)
+        .map(|address| address + 12)
+        .collect()
+}
+
+/// Where as many words of the MCU's RAM are what is looked for.
+fn find_in_ram(
+    rig: &Rig<'_>,
+    length: usize,
+    fits: impl Fn(&[u32]) -> bool,
+) -> impl Iterator<Item = u32> {
     let words: Vec<u32> = (SRAM_START..SRAM_START + SRAM_LENGTH)
         .step_by(4)
         .map(|address| rig.machine.ram_word(address).unwrap_or(0))
         .collect();
+    let fitting: Vec<bool> = words.windows(length).map(fits).collect();
     (SRAM_START..)
         .step_by(4)
-        .zip(words.windows(wanted.len()))
-        .filter(|(_, window)| *window == wanted)
-        .map(|(address, _)| address + 12)
-        .collect()
+        .zip(fitting)
+        .filter_map(|(address, fits)| fits.then_some(address))
+}
+
+/// What is worked out from the configuration.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Factor {
+    /// Amperes per code of the ADS1100 in the small range.
+    Converter,
+    /// Charge of a count of the ADE7753 in the small range.
+    Meter,
+    /// The capacity that the state of charge is a share of.
+    StateOfCharge,
+    /// The level below which the small sensor is open.
+    OpenSensor,
+}
+
+/// Wherever the MCU's RAM holds this factor of the factory's configuration: the address of a word, and the bit in it that
+/// changes the factor by an eighth to a quarter. Looked for with a neighbour of the same kind, and to a per cent where the
+/// supply goes into it.
+pub fn factors_in_ram(rig: &Rig<'_>, factor: Factor) -> Vec<(u32, u32)> {
+    /// Of the largest bit.
+    const DOWN: u32 = 2;
+    let configuration = Configuration::default();
+    if factor == Factor::OpenSensor {
+        let levels = OpenSensorThresholds::prepare(
+            &configuration.open_sensor,
+            &configuration.front_end,
+            None,
+        );
+        let wanted = [
+            levels.open_below,
+            levels.low_rail_below,
+            levels.high_rail_above,
+        ]
+        .map(|level| i64::from(level.get()));
+        let bit = 1 << (wanted[0].ilog2() - DOWN);
+        return find_in_ram(rig, wanted.len(), |window| {
+            let values = window.iter().map(|word| i64::from(word.cast_signed()));
+            values
+                .zip(wanted)
+                .all(|(value, wanted)| is_near(value, wanted))
+        })
+        .map(|address| (address, bit))
+        .collect();
+    }
+    let wanted = match factor {
+        Factor::Meter => {
+            let calibration = MeterCalibration::new(configuration.meter, 1);
+            [Range::Small, Range::Large].map(|range| calibration.scale(range))
+        }
+        Factor::StateOfCharge => {
+            let capacity = SocCoefficients::new(&configuration.soc).capacity().get();
+            // Its neighbour: of the capacity's highest 31 bits, the reciprocal that makes it a share.
+            let scaled = capacity >> (capacity.ilog2() - 30);
+            [
+                capacity,
+                (i64::from(Ppm::ONE.get()) << RECIPROCAL_PLACES) / scaled,
+            ]
+        }
+        Factor::Converter | Factor::OpenSensor => {
+            let coefficients = ConverterCoefficients::prepare(
+                &configuration.converter,
+                &configuration.front_end,
+                &Corrections::default(),
+                None,
+            );
+            // Its neighbour: the current at code 0.
+            let offset =
+                i64::from(coefficients.current(0, Range::Small).get()) << converter::FRACTION_BITS;
+            [coefficients.slope(Range::Small), offset]
+        }
+    };
+    let place = wanted[0].ilog2() - DOWN;
+    find_in_ram(rig, 4, |window| {
+        let [a, b, c, d] = *window else {
+            return false;
+        };
+        let value = |low, high| (u64::from(high) << 32 | u64::from(low)).cast_signed();
+        is_near(value(a, b), wanted[0]) && is_near(value(c, d), wanted[1])
+    })
+    .map(|address| (address + place / 32 * 4, 1 << (place % 32)))
+    .collect()
+}
+
+fn is_near(value: i64, wanted: i64) -> bool {
+    value.abs_diff(wanted) <= wanted.unsigned_abs() / 100
 }
 
 /// Where nothing is on the chip's buses: the external memory's range, which this board has none in.
@@ -1071,6 +1191,8 @@ mod tests {
             ("F1:nan", "'nan'"),
             ("F1:inf", "'inf'"),
             ("F9:1s@", "''"),
+            ("F22:battery", "'battery'"),
+            ("F22:meter,1", "'1'"),
         ] {
             let error = parse(text).unwrap_err().to_string();
             assert!(error.contains(says), "{text}: {error}");

@@ -41,7 +41,7 @@ pub struct MeterLink {
     pub latency_us: u32,
     /// To the meter: what bridges a gap.
     pub bridge: GapBridge,
-    /// To the meter: another calibration, until it has taken it.
+    /// To the meter: another calibration or the same one again, until it has taken it.
     pub calibration: Option<MeterCalibration>,
 }
 
@@ -56,7 +56,7 @@ pub struct Conditions {
     pub flash_fault: bool,
     /// The same, as long as the chip does not answer.
     pub flash_missing: bool,
-    /// What the last check of the configuration in RAM has found.
+    /// What the last check of the configuration in RAM and of the factors made from it has found.
     pub configuration_corrupt: bool,
     /// Set by the storage task.
     pub log_full: bool,
@@ -105,6 +105,7 @@ struct Seen {
     storms: u32,
     refused_frames: u32,
     overruns: u32,
+    damaged: u32,
 }
 
 /// Whether a counter has grown since the last look.
@@ -155,8 +156,7 @@ impl Center {
         self.measurement = Measurement::new(&configuration, state, loss, now);
         self.configuration = configuration;
         self.slots = slots;
-        self.measurement
-            .changed_meter_calibration(&self.configuration)
+        self.measurement.due_meter_calibration(&self.configuration)
     }
 
     /// Another configuration is active.
@@ -224,9 +224,7 @@ impl Center {
         }
         self.log_due |= !tick.changes.cleared.is_empty();
         self.send(now);
-        link.calibration = self
-            .measurement
-            .changed_meter_calibration(&self.configuration);
+        link.calibration = self.measurement.due_meter_calibration(&self.configuration);
         if self.ticks.is_multiple_of(10) {
             let (slot, bytes) = self.slots.write(&self.measurement.retained(0));
             retain::set_slot(slot, &bytes);
@@ -309,7 +307,8 @@ impl Center {
             ),
             (
                 Code::ConfigurationCorruptRam,
-                self.conditions.configuration_corrupt,
+                self.conditions.configuration_corrupt
+                    | grown(&mut seen.damaged, link.report.damaged),
             ),
             (
                 Code::LogFull,

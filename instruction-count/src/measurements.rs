@@ -3,7 +3,7 @@
 use core_logic::{
     configuration::Configuration,
     converter::{Converter, ConverterCoefficients, ConverterSample, Corrections, SampleContext},
-    measurement::Measurement,
+    measurement::{Measurement, prepare},
     meter::MeterReport,
     range::{EdgeRecorder, Range, RangeHistory},
     sliding_average::SlidingAverage,
@@ -19,6 +19,7 @@ pub fn all(counter: &mut Counter) {
     range_edge(counter);
     current_sample(counter);
     whole_conversion(counter);
+    factors(counter);
 }
 
 fn at(micros: u64) -> Instant {
@@ -135,4 +136,21 @@ fn whole_conversion(counter: &mut Counter) {
             measurement.on_meter(&configuration, &report, Validity::VALID);
         },
     );
+}
+
+/// What the check of the factors takes once a second, and a change of the supply by 1 mV. Stated, not promised.
+fn factors(counter: &mut Counter) {
+    let configuration = Configuration::default();
+    let mut measurement = Measurement::new(&configuration, None, Nanocoulombs::ZERO, at(0));
+    let basis = measurement.basis();
+    let prepared = prepare(&configuration, &basis);
+    counter.measure("factors: worked out", None, &[()], |()| {
+        prepare(&configuration, &basis)
+    });
+    counter.measure("factors: compared", None, &[()], |()| {
+        measurement.check_factors(&basis, &prepared)
+    });
+    counter.measure("factors: the meter's", None, &[()], |()| {
+        measurement.due_meter_calibration(&configuration)
+    });
 }

@@ -1,7 +1,7 @@
 //! F22 and F24: RAM and program.
 
 use core_logic::range::Range;
-use emulator::faults::configurations_in_ram;
+use emulator::faults::{Factor, configurations_in_ram, factors_in_ram};
 use emulator::mcu::rcc::ResetCause;
 use emulator::rig::Setup;
 use emulator::scenario::{Contactors, Scenario};
@@ -45,6 +45,73 @@ fn fault_f22_a_flipped_bit_of_the_configuration_is_found_and_defaults_take_over(
     // The guarded one and the one that is measured with.
     assert!(found >= 2, "{found} of {} copies are watched", copies.len());
     assert_eq!(defaulted, 1);
+}
+
+/// What is worked out from the configuration is worked out anew once a second.
+#[test]
+fn fault_f22_a_flipped_bit_of_a_factor_is_found_within_a_second_and_costs_no_charge() {
+    const CURRENT_A: f64 = 20.0;
+    const LENGTH_S: f64 = 6.0;
+    for (name, factor) in [
+        ("converter", Factor::Converter),
+        ("meter", Factor::Meter),
+        ("soc", Factor::StateOfCharge),
+        ("sensor", Factor::OpenSensor),
+    ] {
+        let mut rig = pulse(CURRENT_A, LENGTH_S);
+        let before = charges_c(&mut rig);
+        // The meter's mean is of a second. Right after a check.
+        rig.run_s(2.65).unwrap();
+        let places = factors_in_ram(&rig, factor).len();
+        assert_ne!(places, 0, "{name}");
+        strike(&mut rig, &format!("F22:{name}"));
+        assert_eq!(factors_in_ram(&rig, factor), []);
+        let struck_s = rig.now_s();
+        let (mut named_s, mut righted_s, mut wrong_s) = (None, None, 0.0_f64);
+        watch(&mut rig, 2.5, |rig| {
+            let since_s = rig.now_s() - struck_s;
+            if named_s.is_none() && was_raised(rig, "ConfigurationCorruptRam") {
+                named_s = Some(since_s);
+            }
+            if righted_s.is_none() && !factors_in_ram(rig, factor).is_empty() {
+                righted_s = Some(since_s);
+            }
+            let view = &rig.view;
+            for reading in [view.current_a(), view.average_a(), view.meter_current_a()] {
+                if reading.valid().is_some_and(|a| (a - CURRENT_A).abs() > 0.3) {
+                    wrong_s = since_s;
+                }
+            }
+        });
+        rig.run_s(2.0).unwrap();
+        let error_c = charge_error_c(&mut rig, before);
+        // A wrong factor was seen by the other channel before the check: ChannelsDisagree stands for 10 s.
+        let valid_s = until(&mut rig, "a valid current", 9.0, |rig| {
+            rig.view.current_a().valid().is_some()
+        });
+        println!(
+            "F22 {name}, at {places} places: right again after {righted_s:?} s, ConfigurationCorruptRam on CAN after {named_s:?} s, \
+             last wrong value marked valid after {wrong_s:.3} s, charge error {:.1} mC of {} C, {:?}, valid {valid_s:.1} s later",
+            error_c * 1e3,
+            CURRENT_A * LENGTH_S,
+            unexpected(&rig, &["ConfigurationCorruptRam"])
+        );
+        // Once a second; the meter's factors with its next poll, 20 ms.
+        assert!(
+            righted_s.is_some_and(|s| s <= 1.03),
+            "{name}: {righted_s:?}"
+        );
+        // And the frames.
+        assert!(named_s.is_some_and(|s| s <= 1.2), "{name}: {named_s:?}");
+        assert!(wrong_s <= 1.2, "{name}: {wrong_s}");
+        assert!(
+            error_c.abs() <= quantum_c(Range::Small),
+            "{name}: {error_c}"
+        );
+        let expected = ["ConfigurationCorruptRam", "ChannelsDisagree"];
+        assert_eq!(unexpected(&rig, &expected), Vec::<&str>::new(), "{name}");
+        assert_eq!(resets(&rig), 0);
+    }
 }
 
 #[test]
