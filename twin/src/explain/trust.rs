@@ -102,14 +102,12 @@ pub(super) fn vague_beside(bench: &Workbench<'_>, selection: &mut Selection, bes
     })
 }
 
+/// What the intervals of an effect say against its name.
+type Why<'a> = dyn Fn(&Member, &[[f64; 2]]) -> Option<String> + 'a;
+
 /// Takes effects out, one after the other, against which their intervals say something, or puts the best of its equals in the place;
 /// `beside` as in [`intervals::intervals`]. True if there were any.
-fn withdraw(
-    bench: &Workbench<'_>,
-    selection: &mut Selection,
-    beside: f64,
-    why: &dyn Fn(&Member, &[[f64; 2]]) -> Option<String>,
-) -> bool {
+fn withdraw(bench: &Workbench<'_>, selection: &mut Selection, beside: f64, why: &Why<'_>) -> bool {
     let mut refused: Vec<&'static str> = Vec::new();
     while !selection.named.is_empty() {
         let intervals = intervals::intervals(bench, &selection.fit, beside);
