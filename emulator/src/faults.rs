@@ -1018,7 +1018,7 @@ pub enum Factor {
 /// changes the factor by an eighth to a quarter. Looked for with a neighbour of the same kind, and to a per cent where the
 /// supply goes into it.
 pub fn factors_in_ram(rig: &Rig<'_>, factor: Factor) -> Vec<(u32, u32)> {
-    /// Of the largest bit.
+    /// Places below the largest bit: an eighth to a quarter of the value.
     const DOWN: u32 = 2;
     let configuration = Configuration::default();
     if factor == Factor::OpenSensor {

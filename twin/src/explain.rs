@@ -392,7 +392,7 @@ fn decide(
     shape::withdraw((bench, read), &mut selection, seed);
     let mut taken_back = passed && selection.named.is_empty();
     let placed = name_by_place(bench, &mut selection);
-    let (verdict, left, held, doubted, beside, confirmed) = loop {
+    let (found, left, held, confirmed) = loop {
         let left = features.explain(&selection.fit.residual, seed);
         let confirmed = confirmed(&selection, others);
         let unavoidable = unavoidable(bench, &selection.fit, seed);
@@ -407,11 +407,7 @@ fn decide(
         );
         let held = folds(bench, &selection.fit);
         let not_there = not_there(bench, &selection, others);
-        let Doubt {
-            verdict,
-            names: doubted,
-            beside,
-        } = doubt(
+        let found = doubt(
             bench,
             &mut selection,
             verdict,
@@ -421,11 +417,16 @@ fn decide(
             unavoidable,
         );
         // With what may be another physics, values that were told may be told no more.
-        if !(doubted && vague_beside(bench, &mut selection, beside)) {
-            break (verdict, left, held, doubted, beside, confirmed);
+        if !(found.names && vague_beside(bench, &mut selection, found.beside)) {
+            break (found, left, held, confirmed);
         }
         taken_back |= selection.named.is_empty();
     };
+    let Doubt {
+        verdict,
+        names: doubted,
+        beside,
+    } = found;
     // A file that was never fitted, with a start of its own, tells a start from physics.
     let asked = verdict != Verdict::NoMismatch && (!confirmed || selection.named.is_empty());
     let elsewhere = asked

@@ -11,6 +11,7 @@ pub mod model;
 pub mod prepare;
 pub mod problem;
 pub mod progress;
+pub mod range;
 pub mod report;
 pub mod simulate;
 pub mod spectrum;

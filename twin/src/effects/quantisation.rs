@@ -3,6 +3,7 @@
 use super::scene::{Scale, Scene, rounded};
 use super::{Card, Clues, Effect, Mark, Parameter, Search, Stage};
 use crate::problem::{Problem, View};
+use crate::range::range;
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -47,10 +48,7 @@ impl Effect for Quantisation {
 
     fn mark(&self, scale: &Scale, clues: &Clues<'_>) -> Option<Mark> {
         let step = lattice(clues.observed).filter(|step| *step > 1.5 * scale.quantum)?;
-        let known = clues.observed.iter().filter(|y| y.is_finite());
-        let (low, high) = known.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), y| {
-            (low.min(*y), high.max(*y))
-        });
+        let [low, high] = range(clues.observed.iter().copied())?;
         Some(Mark {
             values: vec![step],
             // Over all of the readings the grid stays in step.

@@ -8,6 +8,7 @@ use crate::{
     failure::Failure,
     model::{Model, Sensor},
     problem::{BatteryBase, Drive, Observed, Problem, View},
+    range::range,
     report::format::count,
 };
 
@@ -89,16 +90,15 @@ pub(super) fn surroundings(frame: &Frame) -> Result<Vec<String>, Failure> {
         ("v_supply_v", "V", SUPPLIES_V, "mV"),
     ] {
         let values = frame.column(name).unwrap_or_default();
-        let known = values.iter().filter(|value| value.is_finite());
-        let (low, high) = known.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
-            (low.min(*value), high.max(*value))
-        });
+        let Some([low, high]) = range(values.iter().copied()) else {
+            continue;
+        };
         let known = values.iter().filter(|value| value.is_finite()).count();
         let possible = values
             .iter()
             .filter(|value| (lowest..=highest).contains(*value))
             .count();
-        if known > 0 && possible == 0 {
+        if possible == 0 {
             return Err(Failure::Input(format!(
                 "{}, column {}: found {} … {}, expected {unit}, {lowest} … {highest} (it may be in {instead})",
                 frame.source(),
@@ -192,11 +192,7 @@ pub(super) fn enough(problem: &Problem, source: &str) -> Result<(), Failure> {
         .count();
     if rows == 0 && outside > 0 && !drive.is_empty() {
         let span = |t_s: &[f64]| {
-            let (low, high) = t_s
-                .iter()
-                .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), t| {
-                    (low.min(*t), high.max(*t))
-                });
+            let [low, high] = range(t_s.iter().copied()).unwrap_or_default();
             format!("{} … {} s", number(shown(low)), number(shown(high)))
         };
         return Err(Failure::Input(format!(

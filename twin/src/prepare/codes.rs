@@ -3,6 +3,7 @@
 use recording::{Table, error::number};
 
 use super::FEWEST_ROWS;
+use crate::range::range;
 
 /// Ends of whole numbers of 16 and 32 bits, with and without a sign, as magnitudes. A bus scales them by a power of ten.
 const ENDS: [f64; 6] = [
@@ -128,13 +129,4 @@ fn codes(values: &[f64], beside: Option<&[f64]>) -> Option<(Vec<Code>, [f64; 2])
         }
     }
     (!found.is_empty()).then_some((found, ends))
-}
-
-/// The lowest and the highest of the values that are there.
-fn range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
-    let known = values.filter(|value| value.is_finite());
-    known.fold(None, |ends: Option<[f64; 2]>, value| {
-        let [low, high] = ends.unwrap_or([value; 2]);
-        Some([low.min(value), high.max(value)])
-    })
 }

@@ -2,6 +2,7 @@
 
 use super::Frame;
 use super::series::median;
+use crate::range::range;
 
 /// Share of repeats, while the reference moves, from which a sensor is read more often than it measures.
 const HELD_SHARE: f64 = 0.2;
@@ -51,12 +52,7 @@ pub fn freshness(
     let t_s = frame.t_s();
     let rows = value.len();
     let pairs = || pairs(frame, value);
-    let (low, high) = value
-        .iter()
-        .filter(|value| value.is_finite())
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| {
-            (low.min(*value), high.max(*value))
-        });
+    let [low, high] = range(value.iter().copied()).unwrap_or_default();
     let digits = DIGITS * low.abs().max(high.abs());
     let same = |before: usize, after: usize| (value[after] - value[before]).abs() <= digits;
     let Some(step) = smallest_step(pairs(), value, digits) else {

@@ -15,6 +15,8 @@ const WANDERS: f64 = 0.1;
 const MOVES: f64 = 0.8;
 /// Share of the steps that are of one size in a slow current that is read in whole counts.
 const OF_ONE_SIZE: f64 = 0.5;
+/// Differences of numbers of some seven digits are the same size if they are within this share.
+const DIGITS: f64 = 1e-6;
 /// Share of a step that the sensor goes ahead of it, at least, …
 const AHEAD: f64 = 0.3;
 /// … with this many standard deviations, …
@@ -122,7 +124,7 @@ fn one_size(held: &[Held]) -> bool {
     let Some(middle) = median(&mut sizes.clone().collect::<Vec<_>>()) else {
         return true;
     };
-    let alike = sizes.filter(|size| (size - middle).abs() <= 1e-6 * middle);
+    let alike = sizes.filter(|size| (size - middle).abs() <= DIGITS * middle);
     alike.count() as f64 > OF_ONE_SIZE * held.len() as f64
 }
 

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use super::data::{Location, LocationKind, Report, SignalPlots};
+use crate::range::range;
 
 /// Values that one page holds over all signals; at some 5 to 9 characters each they stay below 4.5 MB.
 pub const VALUES_PER_PAGE: usize = 500_000;
@@ -273,18 +274,8 @@ fn rms(series: &[f64]) -> f64 {
     (sum / count as f64).sqrt()
 }
 
-fn range(series: &[f64]) -> Option<(f64, f64)> {
-    series
-        .iter()
-        .filter(|v| v.is_finite())
-        .fold(None, |range, v| match range {
-            None => Some((*v, *v)),
-            Some((low, high)) => Some((f64::min(low, *v), f64::max(high, *v))),
-        })
-}
-
 fn range_in_words(name: &str, series: &[f64], unit: &str) -> String {
-    let (low, high) = range(series).unwrap_or((f64::NAN, f64::NAN));
+    let [low, high] = range(series.iter().copied()).unwrap_or([f64::NAN; 2]);
     format!(
         "{name}: {} … {}",
         super::format::significant(low, 3),
@@ -476,7 +467,7 @@ enum Resolution {
 
 impl Column {
     fn of(series: &[f64], resolution: Resolution) -> Self {
-        let (low, high) = range(series).unwrap_or((0.0, 0.0));
+        let [low, high] = range(series.iter().copied()).unwrap_or_default();
         let span = match resolution {
             Resolution::Value if high > low => (high - low) / 1e6,
             Resolution::Value => low.abs().max(1.0) / 1e6,
@@ -523,12 +514,12 @@ fn against(
 ) -> Option<(Against, Words)> {
     let usable = |row: usize| variable[row].is_finite() && before[row].is_finite();
     let total = (0..variable.len()).filter(|row| usable(*row)).count();
-    let (low, high) = range(
-        &variable
+    let [low, high] = range(
+        variable
             .iter()
             .zip(before)
-            .map(|(x, y)| if y.is_finite() { *x } else { f64::NAN })
-            .collect::<Vec<_>>(),
+            .filter(|(_, y)| y.is_finite())
+            .map(|(x, _)| *x),
     )?;
     let width = if high > low { high - low } else { 1.0 };
 
