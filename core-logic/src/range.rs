@@ -425,8 +425,8 @@ pub struct FlagReport {
     pub passed: Option<Range>,
     /// How often a contradiction was reported; stops at the type's end.
     pub episodes: u32,
-    /// Bound of the charge that contradictions which were reported have miscounted since the start, from the last agreement
-    /// before to the first one after.
+    /// Bound of the charge that contradictions have miscounted since the start, from the last agreement before to the first
+    /// one after, whether they were long enough to be reported or not.
     pub miscounted: Nanocoulombs,
 }
 
@@ -450,8 +450,8 @@ pub struct FlagPlausibility {
     differs_since: Option<Instant>,
     /// The newest look: when, and by how much the current was off on the flag's scale.
     last: Option<(Instant, Microamps)>,
-    /// Miscounted since the last agreement by a contradiction that is not reported yet.
-    unreported: Nanocoulombs,
+    /// Miscounted since the last agreement by a contradiction that is neither reported yet nor over.
+    pending: Nanocoulombs,
     report: FlagReport,
 }
 
@@ -462,7 +462,7 @@ impl FlagPlausibility {
         Self {
             differs_since: None,
             last: None,
-            unreported: Nanocoulombs::ZERO,
+            pending: Nanocoulombs::ZERO,
             report: FlagReport {
                 implausible: false,
                 expected: None,
@@ -493,7 +493,7 @@ impl FlagPlausibility {
         };
         if let Some((at, before)) = self.last {
             let doubt = charge_of(off.max(before), elapsed(at, observation.at));
-            self.unreported = self.unreported.saturating_add(doubt);
+            self.pending = self.pending.saturating_add(doubt);
         }
         self.last = Some((observation.at, off));
         let was_implausible = self.report.implausible;
@@ -509,11 +509,9 @@ impl FlagPlausibility {
                 }
             }
         }
-        if was_implausible || self.report.implausible {
-            let unreported = core::mem::take(&mut self.unreported);
-            self.report.miscounted = self.report.miscounted.saturating_add(unreported);
-        } else if !contradiction {
-            self.unreported = Nanocoulombs::ZERO;
+        if was_implausible || self.report.implausible || !contradiction {
+            let pending = core::mem::take(&mut self.pending);
+            self.report.miscounted = self.report.miscounted.saturating_add(pending);
         }
         self.report
     }
@@ -1105,11 +1103,11 @@ mod tests {
                 "{amps} A: {declared_c} of {off_c} C"
             );
         }
-        // Not long enough to be reported, and an OR gate that is stuck: the flag says what is passed.
-        assert_eq!(
-            miscounted(Range::Large, Range::Small, 30.0, 550, true).miscounted,
-            Nanocoulombs::ZERO
-        );
+        // Not long enough to be reported: one look, from the one before it to the one after.
+        let short = miscounted(Range::Large, Range::Small, 30.0, 550, true);
+        assert_eq!(short.episodes, 0);
+        assert_eq!(short.miscounted, Nanocoulombs(270 * 62_000_000));
+        // An OR gate that is stuck: the flag says what is passed.
         let stuck_gate = miscounted(Range::Large, Range::Large, 30.0, 2_500, true);
         assert!(stuck_gate.implausible, "{stuck_gate:?}");
         assert_eq!(stuck_gate.miscounted, Nanocoulombs::ZERO);

@@ -174,3 +174,27 @@ fn fault_f10_a_flag_against_the_level_is_found_and_the_charge_is_doubted() {
         assert!((back.valid().unwrap() - current_a).abs() < 0.5, "{back:?}");
     }
 }
+
+/// Shorter than the debounce, with two conversions in it that no edge has spoiled.
+#[test]
+fn fault_f10_a_contradiction_too_short_to_be_reported_is_declared() {
+    for (stuck, current_a) in [("high", 30.0), ("low", 100.0), ("low", -250.0)] {
+        for length_ms in [70, 80, 90] {
+            let mut rig = steady(current_a);
+            rig.run_s(0.5).unwrap();
+            let before = charges_c(&mut rig);
+            let bound_before_c = charge_bound_c(&rig);
+            strike(&mut rig, &format!("F10:{stuck},{length_ms}ms"));
+            rig.run_s(2.0).unwrap();
+            let error_c = charge_error_c(&mut rig, before);
+            let declared_c = charge_bound_c(&rig) - bound_before_c;
+            println!(
+                "F10 {stuck} for {length_ms} ms at {current_a} A: {error_c:.1} C off, declared {declared_c:.1} C"
+            );
+            assert_eq!(unexpected(&rig, &[]), Vec::<&str>::new());
+            assert!(error_c.abs() > 5.0, "{error_c}");
+            assert!(error_c.abs() <= declared_c, "{error_c} {declared_c}");
+            assert!(declared_c < 2.0 * error_c.abs(), "{error_c} {declared_c}");
+        }
+    }
+}
