@@ -9,6 +9,7 @@
 //! start would do the same, and `told` puts the report together.
 //! Nothing here knows a file or an effect by name.
 
+mod censored;
 mod course;
 mod elsewhere;
 pub mod fit;
@@ -45,7 +46,7 @@ use crate::report::data::{Report, SignalReport, Unexplained, Verdict};
 use course::{Answer, Course};
 use fit::Fit;
 use flexible::{Explainable, Features};
-use select::Selection;
+use select::{Named, Selection};
 use strays::{name_by_place, slips};
 use told::{
     attribute, base_found, current_off, effects, fitted, plots, sentence, short, times_found,
@@ -391,7 +392,7 @@ fn decide(
     }
     shape::withdraw((bench, read), &mut selection, seed);
     let mut taken_back = passed && selection.named.is_empty();
-    let placed = name_by_place(bench, &mut selection);
+    let mut placed = name_by_place(bench, &mut selection);
     let (found, left, held, confirmed) = loop {
         let left = features.explain(&selection.fit.residual, seed);
         let confirmed = confirmed(&selection, others);
@@ -421,6 +422,8 @@ fn decide(
             break (found, left, held, confirmed);
         }
         taken_back |= selection.named.is_empty();
+        let by_place = |named: &Named| named.by_place.is_some();
+        placed = placed.filter(|_| selection.named.iter().any(by_place));
     };
     let Doubt {
         verdict,

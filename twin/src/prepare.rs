@@ -192,10 +192,13 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
             checks::enough(&item.problem, frame.source())?;
         }
     }
-    for item in &items {
-        if let Some(remark) = battery::out_of_charge(&item.problem) {
-            work.remark(remark);
-        }
+    // One battery is behind all of its columns.
+    let of_view = |view| items.iter().find(|item| item.problem.view == view);
+    if let Some(remark) = of_view(View::Voltage)
+        .or_else(|| of_view(View::StateOfCharge))
+        .and_then(|item| battery::out_of_charge(&item.problem))
+    {
+        work.remark(remark);
     }
     if let Some(remark) = supply_without_range(&items) {
         work.remark(remark);

@@ -34,6 +34,8 @@ pub struct Chain<'a> {
     start: Scene<'a>,
     /// The reading as designed less what this chain gives without effects: what the chain does not model itself.
     beside: Vec<f64>,
+    /// Effects of the model file that are not run.
+    left_out: &'static [&'static str],
 }
 
 /// A simulation that was run up to one of its members.
@@ -98,6 +100,7 @@ impl<'a> Chain<'a> {
             problem,
             start: Scene::new(problem),
             beside: Vec::new(),
+            left_out: &[],
         };
         if let Base::Sensor(base) = &problem.base
             && !base.reading.is_empty()
@@ -116,6 +119,12 @@ impl<'a> Chain<'a> {
                 .collect();
         }
         chain
+    }
+
+    /// The same without effects of the model file.
+    pub fn without(mut self, ids: &'static [&'static str]) -> Self {
+        self.left_out = ids;
+        self
     }
 
     /// What the simulation says at each observed row; NaN where the drive does not reach.
@@ -218,6 +227,7 @@ impl<'a> Chain<'a> {
             .problem
             .modelled
             .iter()
+            .filter(|(id, _)| !self.left_out.contains(id))
             .filter_map(|(id, values)| {
                 Some((super::find_with(id, values.len())?, values.as_slice(), None))
             })

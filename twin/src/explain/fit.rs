@@ -5,7 +5,7 @@ use std::collections::HashSet;
 use std::sync::{Arc, OnceLock};
 
 use super::normal::{dot, forget, normal, solve, sum_of};
-use super::robust::{huber, loss, spread, weight};
+use super::robust::{huber, loss, weight};
 use super::slope::{Slope, change, coordinates, rounds, slope, unrounded};
 use super::workbench::{Model, Workbench};
 use crate::effects::Search;
@@ -63,7 +63,7 @@ impl Fit {
         let predicted = bench.run(&model);
         let residual = bench.residual(&predicted);
         Self {
-            sigma: spread(&residual),
+            sigma: bench.spread(&residual),
             model,
             predicted,
             residual,
@@ -206,7 +206,7 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
     }
     let predicted = bench.run(&model);
     let mut here = Point::of(bench, model, predicted);
-    let mut sigma = spread(&here.residual);
+    let mut sigma = bench.spread(&here.residual);
     let mut known = None;
     // The spread falls while the model becomes better: the loss follows in rounds.
     for round in 0..3 {
@@ -216,7 +216,7 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
         if search_steps(aim, &mut here, round > 0) {
             known = descend(aim, &mut here, None);
         }
-        sigma = spread(&here.residual);
+        sigma = bench.spread(&here.residual);
         if sigma > 0.9 * before {
             break;
         }

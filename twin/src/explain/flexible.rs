@@ -52,6 +52,8 @@ pub struct Features {
     gram: DMatrix<f64>,
     folds: Folds,
     timeless: bool,
+    /// See [`Workbench::least_spread`].
+    least_spread: f64,
 }
 
 impl Features {
@@ -124,6 +126,7 @@ impl Features {
             gram,
             folds: Folds::new(grams),
             timeless: bench.problem.quasi_static(),
+            least_spread: bench.least_spread(),
         }
     }
 
@@ -132,7 +135,7 @@ impl Features {
         if self.columns.is_empty() || self.rows.len() < 40 {
             return Explainable::default();
         }
-        let limit = TUNING * spread(residual);
+        let limit = TUNING * spread(residual).max(self.least_spread);
         let residual: Vec<f64> = self
             .rows
             .iter()
@@ -199,7 +202,7 @@ impl Features {
 
     /// What they make of a residual, and another series, both at the features' own rows.
     pub fn shape(&self, residual: &[f64], other: &[f64]) -> (Vec<f64>, Vec<f64>) {
-        let limit = TUNING * spread(residual);
+        let limit = TUNING * spread(residual).max(self.least_spread);
         let here: Vec<f64> = self
             .rows
             .iter()

@@ -253,7 +253,7 @@ pub fn variations(bench: &Workbench<'_>, fit: &Fit) -> Vec<Variation> {
                         let column = &slope.columns[k][rows.clone()];
                         let weighted = column.iter().zip(&weights[rows.clone()]);
                         let weighted: Vec<f64> = weighted.map(|(c, w)| c * w).collect();
-                        let stated = bench.carried(rows.start, &weighted).unwrap_or(0.0)
+                        let stated = bench.stated(rows.start, &weighted)
                             + bench.rounded(rows.start, &weighted);
                         (remembered * loudness).max(stated / matrix[(k, k)])
                     })

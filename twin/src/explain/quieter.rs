@@ -10,7 +10,6 @@ use super::fit::Fit;
 use super::robust::weights;
 use super::slope::change;
 use super::workbench::{Model, Workbench};
-use crate::effects::chain::Chain;
 use crate::problem::Problem;
 
 /// Rows to each side.
@@ -27,7 +26,7 @@ const PARTS: usize = 200;
 /// Whether the change from one fit to another is none that the instrument bears out.
 pub(super) fn only_quietens(bench: &Workbench<'_>, before: &Fit, after: &Fit) -> bool {
     let quiet = quiet(bench);
-    let chain = Chain::new(&quiet);
+    let chain = bench.chain(&quiet);
     let run = |model: &Model| bench.run_on(&chain, model);
     let instrument = change(&run(&after.model), &run(&before.model));
     let change = change(&after.predicted, &before.predicted);

@@ -14,7 +14,7 @@ use rustfft::{Fft, FftPlanner, num_complex::Complex};
 
 use super::fit::Fit;
 use super::normal::{Solver, dot, normal};
-use super::robust::{TUNING, huber, spread};
+use super::robust::{TUNING, huber};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::scene::Scale;
 use crate::effects::{Effect, Search};
@@ -113,7 +113,7 @@ fn thin(bench: &Workbench<'_>) -> Thin {
 /// Entries of every candidate that the model does not have, and placebos.
 pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Screening {
     let thin = thin(bench);
-    let sigma = spread(&fit.residual);
+    let sigma = bench.spread(&fit.residual);
     let take = |series: &[f64]| {
         thin.rows
             .iter()

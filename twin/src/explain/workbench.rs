@@ -9,6 +9,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use rand_distr::{Distribution as _, StandardNormal};
 
+use super::censored::{self, Censored};
+use super::robust::spread;
 use super::slope::change;
 use super::starts::Start;
 use super::steady::Steady;
@@ -130,7 +132,7 @@ pub struct Workbench<'a> {
     pub plain: Vec<f64>,
     /// The drive's reference, but for what noise makes of it at a standstill: what readings are looked at over.
     pub steady: Series,
-    /// The simulation of it as designed, at those rows (for battery views the current).
+    /// The simulation of it as designed, at those rows, ahead of what censors (for battery views the current).
     pub reference: Vec<f64>,
     /// Ranges of those rows that are held out in turn, guards left out.
     pub blocks: Vec<Range<usize>>,
@@ -144,6 +146,8 @@ pub struct Workbench<'a> {
     known: Mutex<HashMap<Key, (Model, f64, f64)>>,
     /// What the readings show by themselves or beside the simulation as designed, by effect: found once.
     marks: Vec<(&'static str, Mark)>,
+    /// Readings that tell no more than within what the signal was: simulations stop short of what makes them so.
+    censored: Option<Censored>,
     /// Makes the stated noise white, with the readings after it.
     white: Option<(Whitening, Vec<f64>)>,
 }
@@ -188,8 +192,12 @@ impl<'a> Workbench<'a> {
         });
         let rows = evenly(valid, MOST_ROWS);
         let at = |series: &[f64]| rows.iter().map(|&row| series[row]).collect::<Vec<f64>>();
-        let (t_s, y, plain) = (at(&observed.t_s), at(&observed.value), at(&all));
+        let (t_s, y, designed) = (at(&observed.t_s), at(&observed.value), at(&all));
+        let censored = Censored::of(problem, &y);
+        // What a censored reading says is not what the effect's equation makes of the signal.
+        let says_nothing = |id: &str| censored.is_some() && censored::EFFECTS.contains(&id);
         let modelled = (0..problem.modelled.len())
+            .filter(|index| !says_nothing(problem.modelled[*index].0))
             .map(|index| {
                 let (id, values) = &problem.modelled[index];
                 let share = find_with(id, values.len()).map_or(0.0, |effect| effect.idealised());
@@ -205,25 +213,40 @@ impl<'a> Workbench<'a> {
             })
             .sum();
         drop(all);
-        let scale = scale(problem, &t_s, &y, &plain);
+        let ahead = |problem: &Problem| {
+            let censored = censored.as_ref()?;
+            let chain = ahead_of(Some(censored), Chain::new(problem));
+            Some((censored, at(&chain.run(&[], &Nuisance::default()))))
+        };
+        let (plain, ahead_of_it) = match ahead(problem) {
+            Some((censored, ahead)) => (Some(censored.as_compared(ahead.clone())), Some(ahead)),
+            None => (None, None),
+        };
+        let scale = scale(problem, &t_s, &y, plain.as_ref().unwrap_or(&designed));
         let found = match &problem.base {
-            Base::Sensor(_) => Steady::of(problem, &scale, &rows, [&y, &plain]),
+            Base::Sensor(_) => Steady::of(problem, &scale, &rows, [&y, &designed]),
             // No voltage is looked at over what a reference's noise makes of a current.
             Base::Battery(_) => None,
         };
         let reference_noise = found.as_ref().map_or(0.0, |still| still.noise);
         let standstills_left = found.as_ref().map_or(0.0, |still| still.left);
         let (steady, reference, standstills) = match (found, &problem.base) {
-            (Some(still), _) => (still.reference, still.plain, still.rows),
+            (Some(still), _) => {
+                let ahead = ahead(&problem.driven_by(still.reference.clone()));
+                let plain = ahead.map_or(still.plain, |(_, ahead)| ahead);
+                (still.reference, plain, still.rows)
+            }
             (None, base) => {
                 let reference = match base {
-                    Base::Sensor(_) => plain.clone(),
+                    Base::Sensor(_) => ahead_of_it.unwrap_or_else(|| designed.clone()),
                     // Battery views are read on the drive's rows or between them: the nearest is near enough for regions.
                     Base::Battery(_) => nearest(problem, &rows),
                 };
                 (problem.drive.reference.clone(), reference, Vec::new())
             }
         };
+        let plain = plain.unwrap_or(designed);
+        let chain = ahead_of(censored.as_ref(), chain);
         let blocks = blocks(&rows);
         let library: Vec<&'static dyn Effect> = LIBRARY
             .iter()
@@ -265,6 +288,7 @@ impl<'a> Workbench<'a> {
             blocks,
             library,
             known: Mutex::default(),
+            censored,
             white: None,
         }
     }
@@ -277,7 +301,7 @@ impl<'a> Workbench<'a> {
         whitening.apply(&mut y);
         Some(Self {
             problem,
-            chain: Chain::new(problem),
+            chain: self.chain(problem),
             scale: self.scale,
             starts: self.starts.clone(),
             rows: self.rows.clone(),
@@ -294,6 +318,7 @@ impl<'a> Workbench<'a> {
             modelled: self.modelled,
             marks: self.marks.clone(),
             known: Mutex::default(),
+            censored: self.censored.clone(),
             white: Some((whitening, y)),
         })
     }
@@ -430,7 +455,7 @@ impl<'a> Workbench<'a> {
             return 0.0;
         }
         let steady = self.problem.driven_by(self.steady.clone());
-        let steady = self.run_on(&Chain::new(&steady), model);
+        let steady = self.run_on(&self.chain(&steady), model);
         let moves = |noise: &[f64]| -> f64 {
             let each = self.standstills.iter().map(|rows| {
                 let noise = &noise[rows.clone()];
@@ -442,7 +467,8 @@ impl<'a> Workbench<'a> {
             });
             each.sum()
         };
-        let designed = self.as_fitted(change(&self.plain, &self.reference));
+        let reference = self.as_compared(self.reference.clone());
+        let designed = self.as_fitted(change(&self.plain, &reference));
         let share = moves(&change(predicted, &steady)) / moves(&designed);
         // What works between the rows evens out noise wherever it is, a threshold where the current stands at it.
         let between = |member: &Member| member.effect.card().stage.is_between_rows();
@@ -540,9 +566,40 @@ impl<'a> Workbench<'a> {
         self.accuracy(row) + 0.5 * self.problem.observed.grid
     }
 
+    /// Spread of a residual. Of readings that tell no more than within what the signal was, most say nothing: what the others are off by is
+    /// no less common for that, and is as loud as the stated noise.
+    pub fn spread(&self, residual: &[f64]) -> f64 {
+        spread(residual).max(self.least_spread())
+    }
+
+    /// What [`Workbench::spread`] is at least.
+    pub fn least_spread(&self) -> f64 {
+        self.censored.as_ref().map_or(0.0, |_| self.problem.noise)
+    }
+
+    /// Variance of a weighted sum of readings from a row on under the stated noise, where that is not what they are seen to differ by:
+    /// it has a memory ([`Workbench::carried`]), or most readings show nothing of it ([`Workbench::spread`]).
+    pub fn stated(&self, from: usize, weights: &[f64]) -> f64 {
+        let white = || self.least_spread().powi(2) * weights.iter().map(|a| a * a).sum::<f64>();
+        self.carried(from, weights).unwrap_or_else(white)
+    }
+
     /// The simulation at the rows that count.
     pub fn run(&self, model: &Model) -> Vec<f64> {
         self.thinned(self.everywhere(model))
+    }
+
+    /// A simulation at the rows that count as readings are compared with it ([`Censored::as_compared`]).
+    fn as_compared(&self, simulation: Vec<f64>) -> Vec<f64> {
+        match &self.censored {
+            Some(censored) => censored.as_compared(simulation),
+            None => simulation,
+        }
+    }
+
+    /// The simulation of another problem with the same readings, as far as this one's goes.
+    pub(super) fn chain<'b>(&self, problem: &'b Problem) -> Chain<'b> {
+        ahead_of(self.censored.as_ref(), Chain::new(problem))
     }
 
     /// The simulation of another chain with the same readings, at the rows that count.
@@ -574,11 +631,12 @@ impl<'a> Workbench<'a> {
     }
 
     fn thinned(&self, all: Vec<f64>) -> Vec<f64> {
-        let mut here = if self.rows.len() == all.len() {
+        let here = if self.rows.len() == all.len() {
             all
         } else {
             self.rows.iter().map(|&row| all[row]).collect()
         };
+        let mut here = self.as_compared(here);
         if self.is_white() {
             // Beyond the drive's ends nothing is known: the reading stands there, and says nothing.
             for (value, y) in here.iter_mut().zip(&self.y) {
@@ -619,6 +677,14 @@ impl<'a> Workbench<'a> {
             && model.members.iter().any(|member| {
                 matches!(member.effect.card().stage, Stage::Filter | Stage::Converter)
             })
+    }
+}
+
+/// A simulation that stops short of what censors, if something does.
+fn ahead_of<'a>(censored: Option<&Censored>, chain: Chain<'a>) -> Chain<'a> {
+    match censored {
+        Some(_) => chain.without(&censored::EFFECTS),
+        None => chain,
     }
 }
 

@@ -50,7 +50,7 @@ pub fn beaten(bench: &Workbench<'_>, other: &Fit, chosen: &Fit) -> bool {
     let (ours, _) = losses(bench, chosen, sigma);
     // Noise with a memory tells two models apart by no more than what it does along their difference, however many the rows.
     let apart = change(&other.predicted, &chosen.predicted);
-    let stated = bench.carried(0, &apart).unwrap_or(0.0) + bench.rounded(0, &apart);
+    let stated = bench.stated(0, &apart) + bench.rounded(0, &apart);
     worse(&theirs, &ours, stated.sqrt() / (sigma * sigma))
 }
 
