@@ -1,5 +1,6 @@
 //! `prove`: the campaign that shows where `twin explain` is right, wrong or silent, and on whose data.
 
+mod alone;
 mod board;
 mod bounds;
 mod case;
@@ -144,6 +145,12 @@ fn run(arguments: &Run) -> Result<bool> {
     let absolute =
         |path: &PathBuf| std::path::absolute(path).with_context(|| path.display().to_string());
     let root = absolute(&arguments.root)?;
+    let out = absolute(&arguments.out)?;
+    let pages = match &arguments.docs {
+        Some(docs) => absolute(docs)?,
+        None => out.join("pages"),
+    };
+    let _alone = [alone::alone_in(&out)?, alone::alone_in(&pages)?];
     let real = real::expected(&root.join("proof/expected.toml"))?;
     let mut plan = plan::plan(arguments.plan, &real, arguments.seeds);
     if let Some(part) = &arguments.only {
@@ -167,7 +174,7 @@ fn run(arguments: &Run) -> Result<bool> {
         None => thread::available_parallelism().map_or(1, usize::from),
     };
     let campaign = Campaign {
-        out: absolute(&arguments.out)?,
+        out,
         tool: Tool {
             program: absolute(&arguments.twin)?,
             threads: 1,
@@ -215,11 +222,6 @@ fn run(arguments: &Run) -> Result<bool> {
             *why = why.replace(here.as_str(), "");
         }
     }
-    let pages = match &arguments.docs {
-        Some(docs) => absolute(docs)?,
-        None => campaign.out.join("pages"),
-    };
-    fs::create_dir_all(&pages).with_context(|| format!("making {}", pages.display()))?;
     let results = pages.join("results.json");
     fs::write(&results, results::text(&summary)?)
         .with_context(|| format!("writing {}", results.display()))?;

@@ -140,10 +140,7 @@ fn run(command: &Command) -> Result<ExitCode> {
             quick,
             minutes,
             seeds,
-        } => {
-            prove::run(&workspace, *quick, *minutes, *seeds)?;
-            Ok(ExitCode::SUCCESS)
-        }
+        } => match prove::run(&workspace, *quick, *minutes, *seeds)? {},
         Command::Emulate { arguments } => match emulate::run(&workspace, "drive", arguments)? {},
         Command::Bench { arguments } => match emulate::run(&workspace, "bench", arguments)? {},
         Command::Build => {

@@ -1,6 +1,6 @@
 //! `cargo xtask prove`: the campaign of proof/, with everything that it needs.
 
-use std::{path::Path, process::Command};
+use std::{convert::Infallible, os::unix::process::CommandExt, path::Path, process::Command};
 
 use anyhow::{Context, Result};
 
@@ -9,13 +9,14 @@ use crate::{
     workspace::Workspace,
 };
 
-/// The whole campaign into docs/proof, or its small part into target/prove/quick. Both go on where a broken run was.
+/// The whole campaign into docs/proof, or its small part into target/prove/quick. Both go on where a broken run was. Becomes
+/// `prove`: what it says and its exit code are its own.
 pub fn run(
     workspace: &Workspace,
     small: bool,
     minutes: Option<u64>,
     seeds: Option<u64>,
-) -> Result<()> {
+) -> Result<Infallible> {
     let python = python::proof_environment(workspace)?;
     apt::program(NGSPICE)?;
     let toolchain = toolchain::choose(workspace)?;
@@ -36,7 +37,8 @@ pub fn run(
     if let Some(seeds) = seeds {
         prove.arg("--seeds").arg(seeds.to_string());
     }
-    process::run(&mut prove)
+    let error = prove.exec();
+    Err(error).context("starting the campaign")
 }
 
 /// The small part, as a step of the tests: with the host programs of the tests' own profile, which are there already.
