@@ -374,12 +374,6 @@ impl ConverterCoefficients {
         Microamps(evaluate(self.ranges.of(range).slope, 0, 1))
     }
 
-    /// µA per unit of input, with [`FRACTION_BITS`].
-    #[must_use]
-    pub const fn slope(&self, range: Range) -> i64 {
-        self.ranges.of(range).slope
-    }
-
     /// The converter whose samples these coefficients are for.
     #[must_use]
     pub const fn channel(&self) -> Channel {

@@ -77,8 +77,8 @@ use crate::units::{
 
 /// Binary digits of a picocoulomb in which charge is summed.
 const FRACTION_BITS: u32 = 24;
-/// One nC in the unit of the sum.
-const NANOCOULOMB: i64 = 1_000 << FRACTION_BITS;
+/// One nC in the unit of the sum and of the factors.
+pub const NANOCOULOMB: i64 = 1_000 << FRACTION_BITS;
 /// Counts by which a difference may exceed the fastest rate, for the hidden bits at both ends and the time stamps.
 pub const RATE_MARGIN_COUNTS: u32 = 4;
 /// Readings refused in a row after which the meter counts as lost.
@@ -435,12 +435,6 @@ impl MeterCalibration {
             coefficients: Coefficients::new(&config),
             number,
         }
-    }
-
-    /// Charge of one count in `range`, in units of 2⁻²⁴ pC.
-    #[must_use]
-    pub const fn scale(&self, range: Range) -> i64 {
-        *self.coefficients.scale.of(range)
     }
 }
 

@@ -58,7 +58,7 @@ const LARGEST_DIFFERENCE: u64 = 1 << 60;
 const PER_US_PLACES: u32 = 22;
 
 /// Binary places of the reciprocal that makes a charge a share of the capacity.
-pub const RECIPROCAL_PLACES: u32 = 42;
+const RECIPROCAL_PLACES: u32 = 42;
 
 /// Binary places of [`SocCoefficients::slew_per_us`].
 const SLEW_PLACES: u32 = 10;

@@ -12,10 +12,10 @@ use plant::supply::SupplyProfile;
 
 use core_logic::configuration::Configuration;
 use core_logic::converter::{self, ConverterCoefficients, Corrections};
-use core_logic::meter::MeterCalibration;
+use core_logic::meter;
 use core_logic::open_sensor::OpenSensorThresholds;
 use core_logic::range::Range;
-use core_logic::soc::{RECIPROCAL_PLACES, SocCoefficients};
+use core_logic::soc::SocCoefficients;
 use core_logic::units::Ppm;
 
 use crate::board::{Board, LineFault};
@@ -1043,19 +1043,22 @@ pub fn factors_in_ram(rig: &Rig<'_>, factor: Factor) -> Vec<(u32, u32)> {
         .map(|address| (address, bit))
         .collect();
     }
-    let wanted = match factor {
+    // The factor and its neighbour.
+    let (wanted, is_neighbour): (i64, Box<dyn Fn(i64) -> bool>) = match factor {
         Factor::Meter => {
-            let calibration = MeterCalibration::new(configuration.meter, 1);
-            [Range::Small, Range::Large].map(|range| calibration.scale(range))
+            let [small, large] = [Range::Small, Range::Large].map(|range| {
+                configuration.meter.charge_per_count(range).get() * meter::NANOCOULOMB
+            });
+            (small, Box::new(move |value| is_near(value, large)))
         }
         Factor::StateOfCharge => {
             let capacity = SocCoefficients::new(&configuration.soc).capacity().get();
-            // Its neighbour: of the capacity's highest 31 bits, the reciprocal that makes it a share.
-            let scaled = capacity >> (capacity.ilog2() - 30);
-            [
-                capacity,
-                (i64::from(Ppm::ONE.get()) << RECIPROCAL_PLACES) / scaled,
-            ]
+            // The reciprocal that makes a charge a share: whatever its binary places, exact to 31 of them.
+            let is_reciprocal = move |value: i64| {
+                let places = (value as f64 * capacity as f64 / f64::from(Ppm::ONE.get())).log2();
+                (places - places.round()).abs() < 1e-6
+            };
+            (capacity, Box::new(is_reciprocal))
         }
         Factor::Converter | Factor::OpenSensor => {
             let coefficients = ConverterCoefficients::prepare(
@@ -1064,19 +1067,22 @@ pub fn factors_in_ram(rig: &Rig<'_>, factor: Factor) -> Vec<(u32, u32)> {
                 &Corrections::default(),
                 None,
             );
-            // Its neighbour: the current at code 0.
-            let offset =
-                i64::from(coefficients.current(0, Range::Small).get()) << converter::FRACTION_BITS;
-            [coefficients.slope(Range::Small), offset]
+            // The neighbour is the current at code 0.
+            let [slope, offset] = [
+                coefficients.step(Range::Small),
+                coefficients.current(0, Range::Small),
+            ]
+            .map(|current| i64::from(current.get()) << converter::FRACTION_BITS);
+            (slope, Box::new(move |value| is_near(value, offset)))
         }
     };
-    let place = wanted[0].ilog2() - DOWN;
+    let place = wanted.ilog2() - DOWN;
     find_in_ram(rig, 4, |window| {
         let [a, b, c, d] = *window else {
             return false;
         };
         let value = |low, high| (u64::from(high) << 32 | u64::from(low)).cast_signed();
-        is_near(value(a, b), wanted[0]) && is_near(value(c, d), wanted[1])
+        is_near(value(a, b), wanted) && is_neighbour(value(c, d))
     })
     .map(|address| (address + place / 32 * 4, 1 << (place % 32)))
     .collect()
