@@ -251,13 +251,6 @@ pub struct Prepared {
     supply: Option<Microvolts>,
 }
 
-impl Prepared {
-    #[inline(never)]
-    fn is(&self, other: &Self) -> bool {
-        self == other
-    }
-}
-
 /// The composition's state.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
@@ -595,11 +588,10 @@ impl Measurement {
     /// Compares the factors in use with those that were worked out anew, of `basis` and a configuration that was just found
     /// sound; whether they are others, as only damage makes them. They are replaced then. The meter's owner is handed its own
     /// again, and finds their damage itself.
-    #[inline(never)]
     pub fn check_factors(&mut self, basis: &Basis, prepared: &Prepared) -> bool {
         self.meter_calibration_due = true;
         // With another basis they have been worked out anew meanwhile.
-        if basis.number != self.basis_number || self.prepared.is(prepared) {
+        if basis.number != self.basis_number || self.prepared == *prepared {
             return false;
         }
         if self.prepared.soc != prepared.soc {
