@@ -114,6 +114,8 @@ pub struct Machine<'table> {
     resets: Vec<ResetEvent>,
     instructions: u64,
     locked_up: bool,
+    /// The reset line is low until then.
+    held_until: Ticks,
     exact: bool,
 }
 
@@ -222,6 +224,7 @@ impl<'table> Machine<'table> {
             resets: Vec::new(),
             instructions: 0,
             locked_up: false,
+            held_until: Ticks(0),
             exact: false,
         };
         machine.power_cycle();
@@ -349,10 +352,17 @@ impl<'table> Machine<'table> {
         self.bus.reset(cause, self.now);
         self.cpu.reset();
         self.locked_up = false;
+        self.held_until = self.now;
         self.resets.push(ResetEvent {
             at: self.now,
             cause,
         });
+    }
+
+    /// The same, and the core starts only after `length`.
+    pub fn hold_in_reset(&mut self, cause: ResetCause, length: Ticks) {
+        self.reset(cause);
+        self.held_until = self.now + length;
     }
 
     fn read_log(&mut self) {
@@ -384,8 +394,13 @@ impl<'table> Machine<'table> {
             }
             let idle = self.cpu.is_asleep() && !self.cpu.wake_pending();
             let locked_up = self.cpu.is_locked_up();
-            if idle || locked_up {
-                self.sleep_until(next.min(end).min(self.next_log));
+            let mut stop = next.min(end).min(self.next_log);
+            let held = self.now < self.held_until;
+            if held {
+                stop = stop.min(self.held_until);
+            }
+            if idle || locked_up || held {
+                self.sleep_until(stop);
                 if locked_up && !self.locked_up {
                     self.locked_up = true;
                     self.log_lines.push(format!(
@@ -397,9 +412,8 @@ impl<'table> Machine<'table> {
                 continue;
             }
             let per_cycle = self.bus.ticks_per_cycle();
-            // Without an event of a peripheral in between, the core runs on alone.
-            let stop = next.min(end).min(self.next_log);
-            // WFI takes one cycle, and so does a step asleep: a few of them in a row are the sign to ask.
+            // Without an event of a peripheral in between, the core runs on alone. WFI takes one cycle, and so does a step
+            // asleep: a few of them in a row are the sign to ask.
             let mut single_cycles = 0;
             while self.now < stop {
                 self.bus.set_now(self.now);

@@ -1,9 +1,11 @@
 //! F19 … F22: the flash and the supply, and what is had again from the flash.
 
+use core_logic::retained::SLOT_WORDS;
 use emulator::faults::configurations_in_ram;
 use emulator::mcu::rcc::ResetCause;
 use emulator::rig::{Rig, Setup};
 use emulator::scenario::{Contactors, Key, Scenario};
+use emulator::time::Ticks;
 use plant::w25q32::{SECTOR, Timing};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
@@ -352,6 +354,96 @@ fn fault_f21_a_loss_of_power_costs_no_more_than_is_declared() {
         // The interval of 360 C, the second that a save may take, and the start.
         assert!(error_c.abs() <= 360.0 + current_a.abs() * 1.5, "{error_c}");
         assert!(was_raised(&rig, "ChargeRestoredWithLoss"));
+    }
+    assert!(beyond.is_empty(), "beyond what is declared: {beyond:?}");
+}
+
+/// Where `firmware/src/retain.rs` keeps its two slots of the charge, and how many words each has.
+const SLOTS: (u32, u32) = (0x2001_FE00 + 8 * 4, SLOT_WORDS as u32);
+
+/// The supplies sag for `length_s` until the MCU resets for `cause`. Its RAM keeps its content, but for a bit in each of
+/// the `damaged` slots of the charge; the flash has no power meanwhile. Meter and converter have 5 V of their own, which may go
+/// with it.
+fn brown_out(rig: &mut Rig<'_>, cause: ResetCause, length_s: f64, with_5_v: bool, damaged: &[u32]) {
+    let now_s = rig.now_s();
+    board(rig, |board| {
+        board.flash.advance(now_s);
+        board.flash.power_off(now_s);
+        board.flash.power_on(now_s + length_s);
+        if with_5_v {
+            board.meter.brown_out(now_s + length_s);
+            board.converter.reset(now_s);
+        }
+    });
+    for slot in damaged {
+        let address = SLOTS.0 + slot * SLOTS.1 * 4;
+        let word = rig.machine.ram_word(address).unwrap();
+        rig.machine.set_ram_word(address, word ^ 1);
+    }
+    let length = Ticks::from_seconds(length_s);
+    rig.machine.hold_in_reset(cause, length);
+    rig.view = Default::default();
+    rig.run_for(length).unwrap();
+}
+
+#[test]
+fn fault_f21_a_brown_out_costs_no_more_than_is_declared() {
+    use ResetCause::{BrownOut, PowerOn};
+    let mut beyond = Vec::new();
+    for (cause, current_a, length_s, with_5_v, damaged) in [
+        (BrownOut, 50.0, 0.01, false, &[][..]),
+        (BrownOut, 50.0, 0.5, false, &[]),
+        (BrownOut, 300.0, 0.5, true, &[]),
+        (BrownOut, -50.0, 0.5, true, &[0]),
+        (BrownOut, -50.0, 0.5, true, &[1]),
+        (BrownOut, 300.0, 0.5, true, &[0, 1]),
+        // So low that the flags say no more than after a power-on: what RAM has kept is not used.
+        (PowerOn, 300.0, 0.5, true, &[]),
+    ] {
+        let mut rig = boot(Vec::new(), current_a);
+        rig.run_s(3.5).unwrap();
+        let before = charges_c(&mut rig);
+        brown_out(&mut rig, cause, length_s, with_5_v, damaged);
+        let silent = rig.view.last_at("Current").is_none();
+        let first_s = started(&mut rig);
+        rig.run_s(1.5).unwrap();
+        let error_c = charge_error_c(&mut rig, before);
+        let declared_c = charge_bound_c(&rig);
+        println!(
+            "F21 {cause:?} of {length_s} s at {current_a} A, with 5 V {with_5_v}, slots {damaged:?} damaged: valid after {:.0} ms, \
+             charge {error_c:+.2} C, declared {declared_c:.2} C",
+            first_s * 1e3
+        );
+        until(&mut rig, "the cause on CAN", 2.0, |rig| {
+            rig.view.signal("Identity", "IdentityPage") == Some(0.0)
+        });
+        let said = rig.view.signal("Identity", "ResetCause");
+        let is_brown_out = cause == BrownOut;
+        assert_eq!(said, Some(if is_brown_out { 2.0 } else { 1.0 }));
+        assert_eq!(was_raised(&rig, "BrownOutReset"), is_brown_out);
+        let expected = ["BrownOutReset", "ChargeRestoredWithLoss"];
+        assert_eq!(unexpected(&rig, &expected), Vec::<&str>::new());
+        assert!(silent);
+        assert_eq!(resets(&rig), 1);
+        assert_eq!(rig.view.charge_c().validity, 0);
+        if error_c.abs() > declared_c {
+            beyond.push((current_a, error_c, declared_c));
+        }
+        // The reset, the age of a slot or two, the start with the meter's self-test; of the flash's record the save interval and
+        // a second.
+        let from_ram = is_brown_out && damaged.len() < 2;
+        let (time_s, interval_c) = if from_ram {
+            (0.1 * (1 + damaged.len()) as f64, 0.0)
+        } else {
+            (1.0, 360.0)
+        };
+        let most_c = current_a.abs() * (length_s + time_s + 0.15) + interval_c;
+        assert!(error_c.abs() <= most_c, "{error_c} beyond {most_c}");
+        assert_eq!(
+            error_c.abs() > current_a.abs() * 1.0,
+            !from_ram,
+            "{error_c}"
+        );
     }
     assert!(beyond.is_empty(), "beyond what is declared: {beyond:?}");
 }
