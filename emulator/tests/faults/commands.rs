@@ -87,6 +87,14 @@ fn fault_f25_a_zero_at_the_wrong_time_is_refused_and_the_old_one_stays() {
     assert!((taken - 500_000).abs() < 20_000, "{taken}");
 }
 
+/// Until the storage task has had a turn: the next one, with which it takes up an order, is 100 ms later. Six requests take
+/// 61 ms.
+fn await_turn(rig: &mut Rig<'_>) {
+    // Of all orders of the flash the one that no setting shows.
+    command(rig, 10).unwrap();
+    until(rig, "a turn", 2.0, |rig| state(rig).0 == 2);
+}
+
 #[test]
 fn fault_f25_what_is_ordered_of_the_flash_waits_for_the_order_before() {
     const CAPACITY: u16 = 0x0700;
@@ -96,6 +104,7 @@ fn fault_f25_what_is_ordered_of_the_flash_waits_for_the_order_before() {
     let mut rig = parked();
     write_registers(&mut rig, CAPACITY, &mah(100_000)).unwrap();
     let written = input_registers(&mut rig, 0x0148, 2);
+    await_turn(&mut rig);
     command(&mut rig, save).unwrap();
     for number in [restore, factory_defaults, save, clear_log] {
         assert_eq!(command(&mut rig, number), Err(6), "{number} after a save");
@@ -107,6 +116,7 @@ fn fault_f25_what_is_ordered_of_the_flash_waits_for_the_order_before() {
     assert_eq!(capacity(&mut rig), mah(100_000));
 
     write_registers(&mut rig, CAPACITY, &mah(300_000)).unwrap();
+    await_turn(&mut rig);
     command(&mut rig, restore).unwrap();
     for number in [save, factory_defaults, restore, clear_log] {
         let answer = command(&mut rig, number);
@@ -119,6 +129,7 @@ fn fault_f25_what_is_ordered_of_the_flash_waits_for_the_order_before() {
 
     command(&mut rig, factory_defaults).unwrap();
     assert_eq!(capacity(&mut rig), mah(240_000));
+    await_turn(&mut rig);
     command(&mut rig, clear_log).unwrap();
     // The log has nothing to do with the settings.
     write_registers(&mut rig, CAPACITY, &mah(200_000)).unwrap();
