@@ -1,8 +1,14 @@
 //! `cargo xtask prove`: the campaign of proof/, with everything that it needs.
 
-use std::{convert::Infallible, os::unix::process::CommandExt, path::Path, process::Command};
+use std::{
+    convert::Infallible,
+    fs::{File, TryLockError},
+    os::unix::process::CommandExt,
+    path::{Path, PathBuf},
+    process::Command,
+};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 
 use crate::{
     apt, emulate::tool, image, process, python, test_command::NGSPICE, toolchain,
@@ -17,6 +23,7 @@ pub fn run(
     minutes: Option<u64>,
     seeds: Option<u64>,
 ) -> Result<Infallible> {
+    refuse_if_busy(&out(workspace, small))?;
     let python = python::proof_environment(workspace)?;
     apt::program(NGSPICE)?;
     let toolchain = toolchain::choose(workspace)?;
@@ -58,18 +65,40 @@ pub fn quick(workspace: &Workspace, image: &Path, python: &Path) -> Result<()> {
     process::run(&mut prove)
 }
 
+/// Where data and results go.
+fn out(workspace: &Workspace, small: bool) -> PathBuf {
+    workspace.target_dir.join("prove").join(plan(small))
+}
+
+const fn plan(small: bool) -> &'static str {
+    if small { "quick" } else { "full" }
+}
+
+/// `prove` refuses to run where another run has locked the folder. Here it is asked before anything is built, for the other run
+/// goes on with what is built now.
+fn refuse_if_busy(folder: &Path) -> Result<()> {
+    if let Ok(file) = File::open(folder)
+        && let Err(TryLockError::WouldBlock) = file.try_lock()
+    {
+        bail!(
+            "another run is at work in {}: start this one again when that has ended",
+            folder.display()
+        );
+    }
+    Ok(())
+}
+
 fn arguments(
     prove: &mut Command,
     workspace: &Workspace,
     small: bool,
     [twin, emulate, image, python]: [&Path; 4],
 ) {
-    let plan = if small { "quick" } else { "full" };
     prove
-        .args(["run", "--plan", plan, "--root"])
+        .args(["run", "--plan", plan(small), "--root"])
         .arg(&workspace.root)
         .arg("--out")
-        .arg(workspace.target_dir.join("prove").join(plan))
+        .arg(out(workspace, small))
         .arg("--twin")
         .arg(twin)
         .arg("--emulate")
@@ -80,5 +109,27 @@ fn arguments(
         .arg(python);
     if !small {
         prove.arg("--docs").arg(workspace.root.join("docs/proof"));
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use std::{env, fs};
+
+    use super::*;
+
+    #[test]
+    fn a_folder_with_a_run_in_it_is_busy_until_that_ends() {
+        let folder = env::temp_dir().join(format!("hallmark-prove-{}", std::process::id()));
+        assert!(refuse_if_busy(&folder).is_ok());
+        fs::create_dir_all(&folder).unwrap();
+        let run = File::open(&folder).unwrap();
+        run.lock().unwrap();
+        let refused = refuse_if_busy(&folder).unwrap_err().to_string();
+        assert!(refused.contains(folder.to_str().unwrap()), "{refused}");
+        run.unlock().unwrap();
+        assert!(refuse_if_busy(&folder).is_ok());
+        fs::remove_dir_all(&folder).unwrap();
     }
 }
