@@ -395,6 +395,13 @@ pub trait Effect: Sync {
         false
     }
 
+    /// Of an effect that cuts or rounds: the ends between which a signal was that came out of it between these, in the view's unit, the
+    /// lower one first; the same ends if it came through as it is, infinite ones where nothing is known. `off`: how far readings may be off
+    /// what comes out. `None` if nothing comes out there.
+    fn came_of(&self, _values: &[f64], came_out: [f64; 2], _off: f64) -> Option<[f64; 2]> {
+        Some(came_out)
+    }
+
     /// Of an effect that cuts or rounds: whether the readings show that noise went in with the signal, and was not added behind it.
     fn noise_ahead(&self, _values: &[f64], _clues: &Clues<'_>) -> bool {
         true

@@ -49,7 +49,8 @@ use flexible::{Explainable, Features};
 use select::{Named, Selection};
 use strays::{name_by_place, slips};
 use told::{
-    attribute, base_found, current_off, effects, fitted, plots, sentence, short, times_found,
+    attribute, base_found, contradicted, current_off, effects, fitted, plots, sentence, short,
+    times_found,
 };
 use trust::{vague, vague_beside, wavering};
 use unfitted::{Unfitted, confirmed, not_there, veto};
@@ -292,6 +293,7 @@ fn tell(
     report
         .remarks
         .extend(times_found(&read, &selection.fit, between));
+    report.remarks.extend(contradicted(&read));
     let off = current_off(bench, &selection).into_iter();
     report
         .remarks

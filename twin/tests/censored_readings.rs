@@ -122,18 +122,35 @@ fn a_sensitivity_error_is_told_through_it() {
     }
 }
 
-/// What is not as stated is a mismatch, whichever way it differs.
+/// What is not as stated is a mismatch, whichever way it differs; and where readings tell by themselves, a remark says which and why.
 #[test]
 fn other_ends_than_stated_are_no_agreement() {
     let threshold = |threshold| Ends { threshold, ..NONE };
-    for [there, stated] in [
-        [threshold(1.0), THRESHOLD],
-        [threshold(6.0), THRESHOLD],
-        [Ends { step: 6.0, ..NONE }, STEPS],
-        [Ends { rail: 9.0, ..NONE }, RAILS],
-        [Ends { rail: 15.0, ..NONE }, RAILS],
+    for (there, stated, told) in [
+        (threshold(1.0), THRESHOLD, Some("[effects.dead-band]")),
+        (threshold(6.0), THRESHOLD, None),
+        (
+            Ends { step: 6.0, ..NONE },
+            STEPS,
+            Some("[effects.quantisation]"),
+        ),
+        (Ends { rail: 9.0, ..NONE }, RAILS, None),
+        (
+            Ends { rail: 15.0, ..NONE },
+            RAILS,
+            Some("[effects.clipping]"),
+        ),
     ] {
         let report = of(|i| i, [there, stated], 1);
         assert_ne!(report.verdict, Verdict::NoMismatch, "{}", report.summary);
+        let remark = report
+            .remarks
+            .iter()
+            .find(|remark| remark.contains("lets through"));
+        match (told, remark) {
+            (None, None) => {}
+            (Some(told), Some(remark)) => assert!(remark.contains(told), "{remark}"),
+            (told, remark) => panic!("{told:?} and {remark:?}"),
+        }
     }
 }

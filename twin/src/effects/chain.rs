@@ -34,8 +34,8 @@ pub struct Chain<'a> {
     start: Scene<'a>,
     /// The reading as designed less what this chain gives without effects: what the chain does not model itself.
     beside: Vec<f64>,
-    /// Effects of the model file that are not run.
-    left_out: &'static [&'static str],
+    /// It stops short of what cuts or rounds in the model file.
+    ahead: bool,
 }
 
 /// A simulation that was run up to one of its members.
@@ -100,7 +100,7 @@ impl<'a> Chain<'a> {
             problem,
             start: Scene::new(problem),
             beside: Vec::new(),
-            left_out: &[],
+            ahead: false,
         };
         if let Base::Sensor(base) = &problem.base
             && !base.reading.is_empty()
@@ -121,9 +121,9 @@ impl<'a> Chain<'a> {
         chain
     }
 
-    /// The same without effects of the model file.
-    pub fn without(mut self, ids: &'static [&'static str]) -> Self {
-        self.left_out = ids;
+    /// The same without the effects of the model file that cut or round.
+    pub fn ahead_of_cuts(mut self) -> Self {
+        self.ahead = true;
         self
     }
 
@@ -227,10 +227,10 @@ impl<'a> Chain<'a> {
             .problem
             .modelled
             .iter()
-            .filter(|(id, _)| !self.left_out.contains(id))
             .filter_map(|(id, values)| {
                 Some((super::find_with(id, values.len())?, values.as_slice(), None))
             })
+            .filter(|(effect, _, _)| !(self.ahead && effect.cuts()))
             .chain(
                 members
                     .iter()

@@ -95,6 +95,26 @@ impl Effect for Clipping {
         true
     }
 
+    fn came_of(&self, values: &[f64], [low, high]: [f64; 2], off: f64) -> Option<[f64; 2]> {
+        let (top, bottom) = (values[0], values[1]);
+        if low > top + off || high < bottom - off {
+            return None;
+        }
+        // What came out between two ends was at a rail if that is between them, and not if it is one of them.
+        let near = if low < high { -off } else { off };
+        let low = if low <= bottom + near {
+            f64::NEG_INFINITY
+        } else {
+            low
+        };
+        let high = if high >= top - near {
+            f64::INFINITY
+        } else {
+            high
+        };
+        Some([low, high])
+    }
+
     fn at_odds(&self, values: &[f64]) -> Option<&'static str> {
         (values[0] < values[1]).then_some("high_a, not below low_a")
     }

@@ -7,6 +7,9 @@ use super::{BENT, Card, Clues, Effect, Parameter, Search, Stage};
 #[derive(Debug)]
 pub struct DeadBand;
 
+/// A threshold is as stated if nothing but zero is below this share of it: it is told by the few readings next to it.
+const AS_STATED: f64 = 0.9;
+
 static CARD: Card = Card {
     id: "dead-band",
     statement: "Currents below a threshold are reported or counted as zero (creep or no-load threshold).",
@@ -55,6 +58,14 @@ impl Effect for DeadBand {
 
     fn cuts(&self) -> bool {
         true
+    }
+
+    fn came_of(&self, values: &[f64], [low, high]: [f64; 2], off: f64) -> Option<[f64; 2]> {
+        let threshold = values[0];
+        if low <= off && high >= -off {
+            return Some([low.min(-threshold), high.max(threshold)]);
+        }
+        (high.max(-low) + off >= AS_STATED * threshold).then_some([low, high])
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

@@ -63,6 +63,18 @@ impl Effect for Quantisation {
         true
     }
 
+    fn came_of(&self, values: &[f64], [low, high]: [f64; 2], _off: f64) -> Option<[f64; 2]> {
+        let step = values[0];
+        let steps = 0.5 * (low + high) / step;
+        if step <= 0.0 {
+            Some([low, high])
+        } else if (steps - steps.round()).abs() > OFF_GRID {
+            None
+        } else {
+            Some([low - 0.5 * step, high + 0.5 * step])
+        }
+    }
+
     fn rounds(&self) -> bool {
         true
     }
@@ -88,6 +100,8 @@ impl Effect for Quantisation {
 const ENOUGH: usize = 4000;
 /// Concentration from which on values are on a grid: what is off it is less than a twentieth of a step.
 const ON_GRID: f64 = 0.95;
+/// Readings lie on a grid if they are off it by no more than this share of a step.
+const OFF_GRID: f64 = 0.1;
 /// A grid is told to this share of a step over the span of the readings.
 const IN_STEP: f64 = 0.1;
 /// A gap is this share off the step at most.

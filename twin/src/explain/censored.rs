@@ -11,17 +11,9 @@
 
 use std::f64::consts::{PI, SQRT_2};
 
+use crate::effects::{Effect, find_with};
 use crate::problem::{Problem, View};
 
-/// The effects of the model file that make such readings.
-pub(super) const EFFECTS: [&str; 3] = [THRESHOLD, STEPS, RAILS];
-const THRESHOLD: &str = "dead-band";
-const STEPS: &str = "quantisation";
-const RAILS: &str = "clipping";
-/// Readings lie on a grid if they are off it by no more than this share of a step.
-const OFF_GRID: f64 = 0.1;
-/// A threshold is as stated if no reading but zero is below this share of it: it is told by the few readings next to it.
-const AS_STATED: f64 = 0.9;
 /// Digits that a reading is written with, as a share of it.
 const DIGITS: f64 = 1e-9;
 /// From so many standard deviations beyond an end on a normal distribution's tail is taken as an exponential one: what that is off
@@ -40,84 +32,63 @@ pub(super) struct Censored {
 /// The ends between which a signal was, the lower one first, in the view's unit; infinite where there is none.
 type Within = [f64; 2];
 
-/// What the model file has at the end of the chain, in the view's unit.
-struct Ends {
-    threshold: f64,
-    step: f64,
-    /// High and low.
-    rails: [f64; 2],
-    /// How far a reading may be off what comes out of them.
-    off: f64,
-}
-
-impl Ends {
-    /// Of a problem; `None` if it has none.
-    fn of(problem: &Problem) -> Option<Self> {
-        let modelled = &problem.modelled;
-        modelled.iter().find(|(id, _)| EFFECTS.contains(id))?;
-        let value = |effect: &str, parameter: usize, otherwise: f64| {
-            let found = modelled.iter().find(|(id, _)| *id == effect);
-            let value = found.and_then(|(_, values)| values.get(parameter).copied());
-            value.filter(|value| value.is_finite()).unwrap_or(otherwise)
-        };
-        let step = value(STEPS, 0, 0.0);
-        Some(Self {
-            threshold: value(THRESHOLD, 0, 0.0),
-            step,
-            rails: [
-                value(RAILS, 0, f64::INFINITY),
-                value(RAILS, 1, f64::NEG_INFINITY),
-            ],
-            off: 0.5 * step.max(problem.observed.grid),
-        })
-    }
-
-    /// Within what the signal was that a reading is of: `Ok(None)` if that came through as it is, and an error if no signal makes
-    /// such a reading.
-    fn within(&self, y: f64) -> Result<Option<Within>, ()> {
-        let off = self.off + DIGITS * y.abs();
-        let [high, low] = self.rails;
-        if y > high + off || y < low - off {
-            return Err(());
-        }
-        let mut ends = [y, y];
-        if self.step > 0.0 {
-            let steps = y / self.step;
-            if (steps - steps.round()).abs() > OFF_GRID {
-                return Err(());
-            }
-            ends = [y - 0.5 * self.step, y + 0.5 * self.step];
-        }
-        if y.abs() <= off {
-            ends = [ends[0].min(-self.threshold), ends[1].max(self.threshold)];
-        } else if y.abs() < AS_STATED * self.threshold - off {
-            return Err(());
-        }
-        if y > high - off {
-            ends[1] = f64::INFINITY;
-        }
-        if y < low + off {
-            ends[0] = f64::NEG_INFINITY;
-        }
-        Ok((ends[0] < ends[1]).then_some(ends))
-    }
+/// Readings that do not come out of an effect of the model file.
+#[derive(Clone)]
+pub(super) struct Contradiction {
+    /// The effect's id.
+    pub effect: &'static str,
+    /// How many there are.
+    pub count: usize,
+    /// The first one, in the view's unit, and its place among those that count.
+    pub first: f64,
+    pub at: usize,
 }
 
 impl Censored {
-    /// Of a problem whose readings `y` count. `None` if the model file states no noise, or nothing that censors; and if the readings are
-    /// not what comes through that: then it is not as stated, or the noise is behind it.
-    pub fn of(problem: &Problem, y: &[f64]) -> Option<Self> {
+    /// Of a problem whose readings `y` count; `None` if the model file states no noise, or nothing that censors.
+    ///
+    /// # Errors
+    /// Readings that do not come through that: then it is not as stated, or noise is added behind it.
+    pub fn of(problem: &Problem, y: &[f64]) -> Result<Option<Self>, Contradiction> {
         if problem.view != View::Sensor || problem.noise <= 0.0 {
-            return None;
+            return Ok(None);
         }
-        let ends = Ends::of(problem)?;
-        let readings: Result<Vec<_>, ()> = y.iter().map(|y| Ok((*y, ends.within(*y)?))).collect();
-        let readings = readings.ok()?;
+        let modelled = problem.modelled.iter();
+        let mut ends: Vec<(&'static dyn Effect, &[f64])> = modelled
+            .filter_map(|(id, values)| Some((find_with(id, values.len())?, values.as_slice())))
+            .filter(|(effect, _)| effect.cuts())
+            .collect();
+        // From the reading back to the signal.
+        ends.sort_by_key(|(effect, _)| std::cmp::Reverse(effect.card().place()));
+        let grid = 0.5 * problem.observed.grid;
+        let mut contradiction: Option<Contradiction> = None;
+        let mut readings = Vec::with_capacity(y.len());
+        for (at, &y) in y.iter().enumerate() {
+            let off = grid + DIGITS * y.abs();
+            let mut within = [y, y];
+            for (effect, values) in &ends {
+                let Some(before) = effect.came_of(values, within, off) else {
+                    let first = || Contradiction {
+                        effect: effect.card().id,
+                        count: 0,
+                        first: y,
+                        at,
+                    };
+                    contradiction.get_or_insert_with(first).count += 1;
+                    break;
+                };
+                within = before;
+            }
+            readings.push((y, (within[0] < within[1]).then_some(within)));
+        }
+        if let Some(contradiction) = contradiction {
+            return Err(contradiction);
+        }
         let any = readings.iter().any(|(_, within)| within.is_some());
-        any.then_some(Self {
+        Ok(any.then_some(Self {
             noise: problem.noise,
             readings,
-        })
+        }))
     }
 
     /// What readings are compared with, row by row, of a simulation ahead of what censors.
@@ -169,6 +140,7 @@ mod tests {
     use rand_distr::{Distribution as _, StandardNormal};
 
     use super::*;
+    use crate::explain::predict;
 
     proptest! {
         #[test]
@@ -200,76 +172,84 @@ mod tests {
         }
     }
 
-    /// Behind all three, at every place of the signal against their ends.
+    /// Readings of a sensor with these effects.
+    fn behind(effects: &[(&'static str, Vec<f64>)], readings: Vec<f64>, noise: f64) -> Problem {
+        let t_s: Vec<f64> = (0..readings.len()).map(|row| row as f64).collect();
+        let mut problem = Problem::pair(t_s, readings.clone(), readings, noise);
+        problem.modelled = effects.to_vec();
+        problem
+    }
+
+    /// Behind all of them, at every place of the signal against their ends.
     #[test]
     fn a_true_simulation_is_off_by_nothing_in_the_mean_and_by_no_more_than_the_noise() {
-        let ends = Ends {
-            threshold: 3.0,
-            step: 0.0,
-            rails: [9.0, f64::NEG_INFINITY],
-            off: 0.0,
-        };
-        let stepped = Ends {
-            step: 2.0,
-            rails: [10.0, f64::NEG_INFINITY],
-            off: 1.0,
-            ..ends
-        };
-        let (noise, count) = (1.0, 100_000);
+        let (noise, count) = (1.0, 50_000);
+        let rail = ("clipping", vec![9.0, f64::NEG_INFINITY]);
+        let threshold = ("dead-band", vec![3.0]);
+        let steps = ("quantisation", vec![2.0]);
+        let chains = [
+            vec![rail.clone(), threshold.clone()],
+            vec![rail, threshold, steps.clone()],
+            vec![steps],
+        ];
         let mut random = ChaCha8Rng::seed_from_u64(1);
-        for (ends, place) in [&ends, &stepped]
-            .into_iter()
-            .flat_map(|ends| (0..24).map(move |place| (ends, place)))
+        for (effects, place) in chains
+            .iter()
+            .flat_map(|effects| (0..24).map(move |place| (effects, place)))
         {
             let signal = 0.5 * f64::from(place);
             let drawn = StandardNormal.sample_iter(&mut random).take(count);
-            let (mut sum, mut squares) = (0.0, 0.0);
-            for drawn in drawn {
-                let drawn: f64 = drawn;
-                let value = (signal + noise * drawn).min(ends.rails[0]);
-                let value = if value.abs() < ends.threshold {
-                    0.0
-                } else {
-                    value
-                };
-                let y = if ends.step > 0.0 {
-                    ends.step * (value / ends.step).round()
-                } else {
-                    value
-                };
-                let residual = match ends.within(y).unwrap() {
-                    Some(within) => -kept_back(signal, within, noise),
-                    None => y - signal,
-                };
-                sum += residual;
-                squares += residual * residual;
-            }
-            let (mean, square) = (sum / count as f64, squares / count as f64);
+            let noisy: Vec<f64> = drawn.map(|drawn: f64| signal + noise * drawn).collect();
+            let ideal = behind(&[], noisy, noise);
+            let readings = predict(&ideal, &named(effects));
+            let problem = behind(effects, readings.clone(), noise);
+            let censored = Censored::of(&problem, &readings).ok().flatten().unwrap();
+            let compared = censored.as_compared(vec![signal; count]);
+            let residuals = || readings.iter().zip(&compared).map(|(y, p)| y - p);
+            let mean = residuals().sum::<f64>() / count as f64;
+            let square = residuals().map(|r| r * r).sum::<f64>() / count as f64;
             let error = noise / (count as f64).sqrt();
             assert!(
                 mean.abs() < 4.0 * error,
-                "{mean} at {signal}, step {}",
-                ends.step
+                "{mean} at {signal} behind {effects:?}"
             );
             let most = noise * noise * (1.0 + 4.0 * SQRT_2 / (count as f64).sqrt());
-            assert!(square < most, "{square} at {signal}");
+            assert!(square < most, "{square} at {signal} behind {effects:?}");
         }
     }
 
+    fn named(effects: &[(&'static str, Vec<f64>)]) -> Vec<(String, Vec<f64>)> {
+        let named = effects.iter();
+        named
+            .map(|(id, values)| ((*id).to_owned(), values.clone()))
+            .collect()
+    }
+
     #[test]
-    fn a_reading_that_no_signal_makes_is_found() {
-        let ends = Ends {
-            threshold: 3.0,
-            step: 0.0,
-            rails: [9.0, -9.0],
-            off: 0.0,
-        };
-        assert_eq!(ends.within(0.0), Ok(Some([-3.0, 3.0])));
-        assert_eq!(ends.within(5.0), Ok(None));
-        assert_eq!(ends.within(9.0), Ok(Some([9.0, f64::INFINITY])));
-        assert_eq!(ends.within(-9.0), Ok(Some([f64::NEG_INFINITY, -9.0])));
-        for y in [1.0, -2.6, 9.1] {
-            assert_eq!(ends.within(y), Err(()), "{y}");
+    fn what_a_reading_tells_is_within_the_ends_that_it_came_through() {
+        let effects = [("clipping", vec![9.0, -9.0]), ("dead-band", vec![3.0])];
+        let readings = vec![0.0, 5.0, 9.0, -9.0];
+        let problem = behind(&effects, readings.clone(), 1.0);
+        let censored = Censored::of(&problem, &readings).ok().flatten().unwrap();
+        let within: Vec<_> = censored
+            .readings
+            .iter()
+            .map(|(_, within)| *within)
+            .collect();
+        let infinite = f64::INFINITY;
+        assert_eq!(
+            within,
+            [
+                Some([-3.0, 3.0]),
+                None,
+                Some([9.0, infinite]),
+                Some([-infinite, -9.0])
+            ]
+        );
+        for (y, effect) in [(1.0, "dead-band"), (-2.6, "dead-band"), (9.1, "clipping")] {
+            let found = Censored::of(&problem, &[0.0, y, y, 5.0]).err().unwrap();
+            assert_eq!((found.effect, found.count), (effect, 2));
+            assert_eq!((found.first, found.at), (y, 1));
         }
     }
 }

@@ -335,6 +335,22 @@ fn base_differs(nuisance: &Nuisance) -> Option<String> {
     (!found.is_empty()).then(|| found.join(" and "))
 }
 
+/// What is to be said of readings that do not come through what the model file says is at the end of the chain.
+pub(super) fn contradicted(bench: &Workbench<'_>) -> Option<String> {
+    let found = bench.contradiction.as_ref()?;
+    let (name, unit) = (&bench.problem.name, &bench.problem.unit);
+    let of_them = match found.count {
+        1 => "one reading is".to_owned(),
+        count => format!("{count} readings are"),
+    };
+    Some(format!(
+        "{name}: {of_them} not what [effects.{}] lets through, the first {} {unit} at {} s: it is not as stated, or noise is added behind it",
+        found.effect,
+        short(found.first),
+        short(bench.t_s[found.at]),
+    ))
+}
+
 /// What the times of the readings, and the reference between its rows, were found to be beside the effects. `course`: the error with
 /// straight lines and with a smooth course, if that was taken.
 pub(super) fn times_found(

@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use rand_distr::{Distribution as _, StandardNormal};
 
-use super::censored::{self, Censored};
+use super::censored::{Censored, Contradiction};
 use super::robust::spread;
 use super::slope::change;
 use super::starts::Start;
@@ -148,6 +148,8 @@ pub struct Workbench<'a> {
     marks: Vec<(&'static str, Mark)>,
     /// Readings that tell no more than within what the signal was: simulations stop short of what makes them so.
     censored: Option<Censored>,
+    /// Readings that the model file's thresholds, steps or rails would not let through.
+    pub(super) contradiction: Option<Contradiction>,
     /// Makes the stated noise white, with the readings after it.
     white: Option<(Whitening, Vec<f64>)>,
 }
@@ -193,14 +195,17 @@ impl<'a> Workbench<'a> {
         let rows = evenly(valid, MOST_ROWS);
         let at = |series: &[f64]| rows.iter().map(|&row| series[row]).collect::<Vec<f64>>();
         let (t_s, y, designed) = (at(&observed.t_s), at(&observed.value), at(&all));
-        let censored = Censored::of(problem, &y);
-        // What a censored reading says is not what the effect's equation makes of the signal.
-        let says_nothing = |id: &str| censored.is_some() && censored::EFFECTS.contains(&id);
+        let (censored, contradiction) = match Censored::of(problem, &y) {
+            Ok(censored) => (censored, None),
+            Err(contradiction) => (None, Some(contradiction)),
+        };
+        // What a censored reading says is not what an equation makes of the signal.
+        let speaks = |effect: &dyn Effect| censored.is_none() || !effect.cuts();
         let modelled = (0..problem.modelled.len())
-            .filter(|index| !says_nothing(problem.modelled[*index].0))
-            .map(|index| {
+            .filter_map(|index| {
                 let (id, values) = &problem.modelled[index];
-                let share = find_with(id, values.len()).map_or(0.0, |effect| effect.idealised());
+                let effect = find_with(id, values.len()).filter(|effect| speaks(*effect))?;
+                let share = effect.idealised();
                 let mut without = problem.clone();
                 without.modelled.remove(index);
                 let without = Chain::new(&without).run(&[], &Nuisance::default());
@@ -209,18 +214,16 @@ impl<'a> Workbench<'a> {
                     .map(|&row| (all[row] - without[row]).powi(2))
                     .filter(|change| change.is_finite())
                     .sum();
-                share * share * energy
+                Some(share * share * energy)
             })
             .sum();
         drop(all);
-        let ahead = |problem: &Problem| {
-            let censored = censored.as_ref()?;
-            let chain = ahead_of(Some(censored), Chain::new(problem));
-            Some((censored, at(&chain.run(&[], &Nuisance::default()))))
-        };
-        let (plain, ahead_of_it) = match ahead(problem) {
-            Some((censored, ahead)) => (Some(censored.as_compared(ahead.clone())), Some(ahead)),
-            None => (None, None),
+        let chain = ahead_of(censored.as_ref(), chain);
+        let ahead = |chain: &Chain<'_>| at(&chain.run(&[], &Nuisance::default()));
+        let designed_ahead = censored.as_ref().map(|_| ahead(&chain));
+        let plain = match (&censored, &designed_ahead) {
+            (Some(censored), Some(ahead)) => Some(censored.as_compared(ahead.clone())),
+            _ => None,
         };
         let scale = scale(problem, &t_s, &y, plain.as_ref().unwrap_or(&designed));
         let found = match &problem.base {
@@ -232,13 +235,14 @@ impl<'a> Workbench<'a> {
         let standstills_left = found.as_ref().map_or(0.0, |still| still.left);
         let (steady, reference, standstills) = match (found, &problem.base) {
             (Some(still), _) => {
-                let ahead = ahead(&problem.driven_by(still.reference.clone()));
-                let plain = ahead.map_or(still.plain, |(_, ahead)| ahead);
+                let driven = problem.driven_by(still.reference.clone());
+                let ahead = |censored| ahead(&ahead_of(Some(censored), Chain::new(&driven)));
+                let plain = censored.as_ref().map_or(still.plain, ahead);
                 (still.reference, plain, still.rows)
             }
             (None, base) => {
                 let reference = match base {
-                    Base::Sensor(_) => ahead_of_it.unwrap_or_else(|| designed.clone()),
+                    Base::Sensor(_) => designed_ahead.unwrap_or_else(|| designed.clone()),
                     // Battery views are read on the drive's rows or between them: the nearest is near enough for regions.
                     Base::Battery(_) => nearest(problem, &rows),
                 };
@@ -246,7 +250,6 @@ impl<'a> Workbench<'a> {
             }
         };
         let plain = plain.unwrap_or(designed);
-        let chain = ahead_of(censored.as_ref(), chain);
         let blocks = blocks(&rows);
         let library: Vec<&'static dyn Effect> = LIBRARY
             .iter()
@@ -289,6 +292,7 @@ impl<'a> Workbench<'a> {
             library,
             known: Mutex::default(),
             censored,
+            contradiction,
             white: None,
         }
     }
@@ -319,6 +323,7 @@ impl<'a> Workbench<'a> {
             marks: self.marks.clone(),
             known: Mutex::default(),
             censored: self.censored.clone(),
+            contradiction: self.contradiction.clone(),
             white: Some((whitening, y)),
         })
     }
@@ -683,7 +688,7 @@ impl<'a> Workbench<'a> {
 /// A simulation that stops short of what censors, if something does.
 fn ahead_of<'a>(censored: Option<&Censored>, chain: Chain<'a>) -> Chain<'a> {
     match censored {
-        Some(_) => chain.without(&censored::EFFECTS),
+        Some(_) => chain.ahead_of_cuts(),
         None => chain,
     }
 }
