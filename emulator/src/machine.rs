@@ -12,6 +12,7 @@ use crate::image::{
     CCM_LENGTH, CCM_START, FLASH_LENGTH, FLASH_START, Image, SRAM_LENGTH, SRAM_START,
 };
 use crate::mcu::adc::Adc1;
+use crate::mcu::flash_interface::FlashInterface;
 use crate::mcu::iwdg::Iwdg;
 use crate::mcu::rcc::{Rcc, ResetCause};
 use crate::mcu::system_bus::{Failure, SystemBus};
@@ -285,6 +286,11 @@ impl<'table> Machine<'table> {
     /// Looks at USART2.
     pub fn usart<T>(&mut self, work: impl FnOnce(&Usart) -> T) -> T {
         self.bus.with_usart(work)
+    }
+
+    /// Works on the flash interface.
+    pub fn flash<T>(&mut self, work: impl FnOnce(&mut FlashInterface) -> T) -> T {
+        self.bus.with_flash(work)
     }
 
     /// Works on ADC1.

@@ -7,6 +7,7 @@
 use core_logic::can::layout::{Direction, MESSAGES, Message};
 use emulator::can_frame::CanFrame;
 use emulator::faults::Fault;
+use emulator::mcu::flash_interface::FlashInterface;
 use emulator::mcu::rcc::ResetCause;
 use emulator::rig::{Firmware, Rig, Setup};
 use emulator::scenario::{Contactors, Key, Row, Scenario};
@@ -35,6 +36,25 @@ fn a_healthy_board_raises_no_diagnosis_while_it_starts() {
     rig.run_s(0.9).unwrap();
     assert!(rig.view.diagnoses.is_empty(), "{:?}", rig.view.diagnoses);
     assert!(rig.view.charge_c().valid().is_some());
+}
+
+/// docs/firmware.md wants the option bytes programmed with the image.
+#[test]
+fn a_brown_out_detector_that_is_off_is_told_at_each_start() {
+    let firmware = firmware();
+    let told = |rig: &mut Rig<'_>| {
+        rig.run_s(0.1).unwrap();
+        let lines = std::mem::take(&mut rig.log);
+        lines
+            .iter()
+            .filter(|line| line.contains("brown-out"))
+            .count()
+    };
+    let mut rig = Rig::new(&firmware, driving(10.0)).unwrap();
+    assert_eq!(told(&mut rig), 0);
+    rig.machine.flash(FlashInterface::set_delivered);
+    rig.machine.reset(ResetCause::Pin);
+    assert_eq!(told(&mut rig), 1);
 }
 
 /// docs/architecture.md: 0.5 ms of jitter; here with a bus that others fill, a client on RS485, a sensor supply that

@@ -243,6 +243,8 @@ impl Board {
 
         retain::note_stage(Stage::Peripherals);
         time::start(dp.TIM2, &mut rcc);
+        // The log has the time.
+        clock::check_brown_out_level(&dp.FLASH);
         let a = dp.GPIOA.split(&mut rcc);
         let b = dp.GPIOB.split(&mut rcc);
         let c = dp.GPIOC.split(&mut rcc);

@@ -43,3 +43,12 @@ pub fn start(rcc: &RCC, flash: &FLASH) {
     });
     while !rcc.cfgr().read().sws().is_pll() {}
 }
+
+/// Logs it if the option bytes let the core go on below 2.7 V, where five wait states are too few: nothing but the brown-out
+/// detector's highest level stops it there.
+pub fn check_brown_out_level(flash: &FLASH) {
+    // 0 is level 3 and 3 is off (RM0090, FLASH_OPTCR): the PAC's names have it the other way round.
+    if flash.optcr().read().bor_lev().bits() != 0 {
+        defmt::warn!("brown-out detector below level 3: program the option bytes (BOR_LEV = 0)");
+    }
+}

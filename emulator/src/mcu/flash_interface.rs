@@ -13,22 +13,35 @@ const ACR_DEFINED: u32 = ACR_LATENCY | ACR_PRFTEN | ACR_ICEN | ACR_DCEN | ACR_IC
 
 const SR_FLAGS: u32 = 0xF3;
 const CR_LOCK: u32 = 1 << 31;
+/// OPTCR as delivered, locked (RM0090, section 3.9.9): the brown-out detector is off.
+const OPTCR_DELIVERED: u32 = 0x0FFF_AAED;
+const OPTCR_BOR_LEV: u32 = 0b11 << 2;
 
 /// Each wait state is good for so much of the AHB clock at 2.7 … 3.6 V (RM0090, table 10), in Hz.
 const HZ_PER_STATE: u32 = 30_000_000;
 
 /// Its registers.
 ///
-/// Not modelled: unlocking, programming, erasing, option bytes. CR stays locked.
+/// Not modelled: unlocking, programming, erasing, what option bytes do. CR and OPTCR stay locked.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct FlashInterface {
     acr: u32,
+    /// As the option bytes say.
+    optcr: u32,
 }
 
 impl FlashInterface {
-    /// After reset: no wait state, no cache.
+    /// After reset: no wait state, no cache. The option bytes are those that docs/firmware.md wants: brown-out detector at level 3.
     pub const fn new() -> Self {
-        Self { acr: 0 }
+        Self {
+            acr: 0,
+            optcr: OPTCR_DELIVERED & !OPTCR_BOR_LEV,
+        }
+    }
+
+    /// Option bytes as delivered.
+    pub const fn set_delivered(&mut self) {
+        self.optcr = OPTCR_DELIVERED;
     }
 
     /// Wait states of an access that no cache answers.
@@ -78,7 +91,10 @@ impl FlashInterface {
                 return Err(unmodelled("FLASH_ACR", "reset of a cache that is on"));
             }
         }
-        let written = Self { acr: value };
+        let written = Self {
+            acr: value,
+            ..*self
+        };
         written.check(clocks)?;
         *self = written;
         Ok(())
@@ -98,6 +114,7 @@ impl Peripheral for FlashInterface {
             // Nothing was ever programmed.
             0x0C => Ok(0),
             0x10 => Ok(CR_LOCK),
+            0x14 => Ok(self.optcr),
             _ => Err(unknown("FLASH", offset, "read")),
         }
     }
@@ -128,7 +145,7 @@ impl Peripheral for FlashInterface {
     fn advance(&mut self, _context: &mut Context<'_>) {}
 
     fn reset(&mut self, _context: &mut Context<'_>) {
-        *self = Self::new();
+        self.acr = 0;
     }
 }
 
@@ -158,6 +175,9 @@ mod tests {
         assert_eq!(world.read(&mut flash, 0x00), 0);
         assert_eq!(world.read(&mut flash, 0x0C), 0);
         assert_eq!(world.read(&mut flash, 0x10), 0x8000_0000);
+        assert_eq!(world.read(&mut flash, 0x14), 0x0FFF_AAE1);
+        flash.set_delivered();
+        assert_eq!(world.read(&mut flash, 0x14), 0x0FFF_AAED);
     }
 
     /// RM0090, table 10, column 2.7 … 3.6 V.
@@ -176,7 +196,10 @@ mod tests {
         for (ahb, needed) in rows {
             let clocks = Clocks { ahb, ..CLOCKS };
             for states in 0..8 {
-                let flash = FlashInterface { acr: states };
+                let flash = FlashInterface {
+                    acr: states,
+                    ..FlashInterface::new()
+                };
                 assert_eq!(
                     flash.check(clocks).is_ok(),
                     states >= needed,

@@ -533,6 +533,11 @@ impl SystemBus {
         work(&mut self.lock().adc1)
     }
 
+    /// Works on the flash interface, for the option bytes that it shows.
+    pub fn with_flash<T>(&self, work: impl FnOnce(&mut FlashInterface) -> T) -> T {
+        work(&mut self.lock().flash)
+    }
+
     /// Works on USART2, for what it knows of how it is served.
     pub fn with_usart<T>(&self, work: impl FnOnce(&Usart) -> T) -> T {
         work(&self.lock().usart2)
