@@ -1,12 +1,12 @@
 //! From problems to named effects: fit, select, say where, how sure and what is left.
 //!
-//! One way: `course` asks how the reference goes from row to row, [`workbench`] makes a problem ready, [`screen`] asks which
-//! effects could account for what is left, [`fit`] fits them, with [`slope`]s, [`normal`] equations and a [`robust`] loss, and
-//! with what the model file leaves open (`starts`); [`held_out`] says what a fit is worth on rows that it was not made of, and
-//! [`select`] decides. [`intervals`] and [`locate`] say how sure and where; `trust`, [`shape`] and `unfitted` take back names
-//! that the recording or other files do not bear out, `strays` looks at readings that no noise makes, `verdict` says what that
-//! makes (`quieter`: whether what works between the rows only evens out noise of the reference), `elsewhere` whether another
-//! start would do the same, and `told` puts the report together.
+//! One way: `course` asks how the reference goes from row to row, [`workbench`] makes a problem ready (`censored`: what readings tell
+//! behind a threshold, steps or rails of the model file), [`screen`] asks which effects could account for what is left, [`fit`] fits
+//! them, with [`slope`]s, [`normal`] equations and a [`robust`] loss, and with what the model file leaves open (`starts`);
+//! [`held_out`] says what a fit is worth on rows that it was not made of, and [`select`] decides. [`intervals`] and [`locate`] say how
+//! sure and where; `trust`, [`shape`] and `unfitted` take back names that the recording or other files do not bear out, `strays`
+//! looks at readings that no noise makes, `verdict` says what that makes (`quieter`: whether what works between the rows only evens
+//! out noise of the reference), `elsewhere` whether another start would do the same, and `told` puts the report together.
 //! Nothing here knows a file or an effect by name.
 
 mod censored;
@@ -49,7 +49,7 @@ use flexible::{Explainable, Features};
 use select::{Named, Selection};
 use strays::{name_by_place, slips};
 use told::{
-    attribute, base_found, contradicted, current_off, effects, fitted, plots, sentence, short,
+    attribute, base_found, behind_ends, current_off, effects, fitted, plots, sentence, short,
     times_found,
 };
 use trust::{vague, vague_beside, wavering};
@@ -248,7 +248,7 @@ fn tell(
     }
     let plain_residual = read.residual(&read.plain);
     let noise = if problem.noise > 0.0 {
-        problem.noise
+        read.noise_left(model, options.seed)
     } else {
         robust::spread(&jumps(&shown.residual)) / std::f64::consts::SQRT_2
     };
@@ -293,7 +293,7 @@ fn tell(
     report
         .remarks
         .extend(times_found(&read, &selection.fit, between));
-    report.remarks.extend(contradicted(&read));
+    report.remarks.extend(behind_ends(&read));
     let off = current_off(bench, &selection).into_iter();
     report
         .remarks

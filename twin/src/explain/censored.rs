@@ -27,6 +27,8 @@ pub(super) struct Censored {
     noise: f64,
     /// Each reading that counts, in the view's unit, and within what the signal was, if that is all that it tells.
     readings: Vec<(f64, Option<Within>)>,
+    /// Ids of the effects that make them so.
+    pub effects: Vec<&'static str>,
 }
 
 /// The ends between which a signal was, the lower one first, in the view's unit; infinite where there is none.
@@ -58,6 +60,9 @@ impl Censored {
             .filter_map(|(id, values)| Some((find_with(id, values.len())?, values.as_slice())))
             .filter(|(effect, _)| effect.cuts())
             .collect();
+        if ends.is_empty() {
+            return Ok(None);
+        }
         // From the reading back to the signal.
         ends.sort_by_key(|(effect, _)| std::cmp::Reverse(effect.card().place()));
         let grid = 0.5 * problem.observed.grid;
@@ -88,7 +93,16 @@ impl Censored {
         Ok(any.then_some(Self {
             noise: problem.noise,
             readings,
+            effects: ends.iter().map(|(effect, _)| effect.card().id).collect(),
         }))
+    }
+
+    /// How many readings tell no more than within what the signal was.
+    pub fn count(&self) -> usize {
+        self.readings
+            .iter()
+            .filter(|(_, within)| within.is_some())
+            .count()
     }
 
     /// What readings are compared with, row by row, of a simulation ahead of what censors.

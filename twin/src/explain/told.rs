@@ -335,10 +335,21 @@ fn base_differs(nuisance: &Nuisance) -> Option<String> {
     (!found.is_empty()).then(|| found.join(" and "))
 }
 
-/// What is to be said of readings that do not come through what the model file says is at the end of the chain.
-pub(super) fn contradicted(bench: &Workbench<'_>) -> Option<String> {
-    let found = bench.contradiction.as_ref()?;
+/// What is to be said of readings behind what the model file says is at the end of the chain, or that do not come through it.
+pub(super) fn behind_ends(bench: &Workbench<'_>) -> Option<String> {
     let (name, unit) = (&bench.problem.name, &bench.problem.unit);
+    if let Some(censored) = &bench.censored {
+        let effects = censored.effects.iter().rev();
+        let effects: Vec<String> = effects.map(|id| format!("[effects.{id}]")).collect();
+        return Some(format!(
+            "{name}: behind {} {} of {} readings tell no more than within what the signal was: their errors, and the noise beside them, are \
+             what noise has to have done for that on average",
+            effects.join(" and "),
+            censored.count(),
+            bench.len(),
+        ));
+    }
+    let found = bench.contradiction.as_ref()?;
     let of_them = match found.count {
         1 => "one reading is".to_owned(),
         count => format!("{count} readings are"),

@@ -147,7 +147,7 @@ pub struct Workbench<'a> {
     /// What the readings show by themselves or beside the simulation as designed, by effect: found once.
     marks: Vec<(&'static str, Mark)>,
     /// Readings that tell no more than within what the signal was: simulations stop short of what makes them so.
-    censored: Option<Censored>,
+    pub(super) censored: Option<Censored>,
     /// Readings that the model file's thresholds, steps or rails would not let through.
     pub(super) contradiction: Option<Contradiction>,
     /// Makes the stated noise white, with the readings after it.
@@ -451,6 +451,36 @@ impl<'a> Workbench<'a> {
             .map(|(noisy, predicted)| (noisy - predicted).powi(2))
             .filter(|change| change.is_finite())
             .sum()
+    }
+
+    /// What the stated noise leaves of a true model, rms, in the view's unit: all of itself, and less of it where readings tell no more
+    /// than within what the signal was, by a drawing of readings.
+    pub fn noise_left(&self, model: &Model, seed: u64) -> f64 {
+        let stated = self.problem.noise;
+        if self.censored.is_none() {
+            return stated;
+        }
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let mut noise = StandardNormal
+            .sample_iter(&mut random)
+            .map(|value: f64| stated * value);
+        let drawn = Chain::new(self.problem).run_with_noise(
+            &members(model),
+            &model.nuisance,
+            Some(&mut noise),
+        );
+        let ahead = self.everywhere(model);
+        let at = |all: &[f64]| self.rows.iter().map(|&row| all[row]).collect::<Vec<f64>>();
+        // Beyond the drive's ends nothing is known: the reading stands there.
+        let known = |(drawn, y): (f64, &f64)| if drawn.is_finite() { drawn } else { *y };
+        let drawn: Vec<f64> = at(&drawn).into_iter().zip(&self.y).map(known).collect();
+        match Censored::of(self.problem, &drawn) {
+            Ok(Some(censored)) => {
+                let compared = censored.as_compared(at(&ahead));
+                rms(drawn.iter().zip(&compared).map(|(y, p)| y - p))
+            }
+            Ok(None) | Err(_) => stated,
+        }
     }
 
     /// Energy of the reference's noise that a model evens out, against the simulation as designed: the error is lower by that whatever
