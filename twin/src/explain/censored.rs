@@ -41,8 +41,9 @@ pub(super) struct Contradiction {
     pub effect: &'static str,
     /// How many there are.
     pub count: usize,
-    /// The first one, in the view's unit, and its place among those that count.
+    /// The first one, in the view's unit.
     pub first: f64,
+    /// Its place among those that count.
     pub at: usize,
 }
 

@@ -26,7 +26,7 @@ const PARTS: usize = 200;
 /// Whether the change from one fit to another is none that the instrument bears out.
 pub(super) fn only_quietens(bench: &Workbench<'_>, before: &Fit, after: &Fit) -> bool {
     let quiet = quiet(bench);
-    let chain = bench.chain(&quiet);
+    let chain = bench.chain_of(&quiet);
     let run = |model: &Model| bench.run_on(&chain, model);
     let instrument = change(&run(&after.model), &run(&before.model));
     let change = change(&after.predicted, &before.predicted);

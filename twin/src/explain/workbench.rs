@@ -305,7 +305,7 @@ impl<'a> Workbench<'a> {
         whitening.apply(&mut y);
         Some(Self {
             problem,
-            chain: self.chain(problem),
+            chain: self.chain_of(problem),
             scale: self.scale,
             starts: self.starts.clone(),
             rows: self.rows.clone(),
@@ -438,13 +438,7 @@ impl<'a> Workbench<'a> {
     /// Squared change, summed over the rows that count, that noise of a standard deviation ahead of the end of the chain makes to
     /// the simulation: a reading near a threshold jumps by noise, and a stepped one has the steps twice.
     pub fn noise_energy(&self, model: &Model, predicted: &[f64], deviation: f64, seed: u64) -> f64 {
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        let mut noise = StandardNormal
-            .sample_iter(&mut random)
-            .map(|value: f64| deviation * value);
-        let noisy = self
-            .chain
-            .run_with_noise(&members(model), &model.nuisance, Some(&mut noise));
+        let noisy = with_noise(&self.chain, model, deviation, seed);
         self.thinned(noisy)
             .iter()
             .zip(predicted)
@@ -460,23 +454,13 @@ impl<'a> Workbench<'a> {
         if self.censored.is_none() {
             return stated;
         }
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        let mut noise = StandardNormal
-            .sample_iter(&mut random)
-            .map(|value: f64| stated * value);
-        let drawn = Chain::new(self.problem).run_with_noise(
-            &members(model),
-            &model.nuisance,
-            Some(&mut noise),
-        );
-        let ahead = self.everywhere(model);
-        let at = |all: &[f64]| self.rows.iter().map(|&row| all[row]).collect::<Vec<f64>>();
+        let drawn = self.at_rows(with_noise(&Chain::new(self.problem), model, stated, seed));
         // Beyond the drive's ends nothing is known: the reading stands there.
         let known = |(drawn, y): (f64, &f64)| if drawn.is_finite() { drawn } else { *y };
-        let drawn: Vec<f64> = at(&drawn).into_iter().zip(&self.y).map(known).collect();
+        let drawn: Vec<f64> = drawn.into_iter().zip(&self.y).map(known).collect();
         match Censored::of(self.problem, &drawn) {
             Ok(Some(censored)) => {
-                let compared = censored.as_compared(at(&ahead));
+                let compared = censored.as_compared(self.at_rows(self.everywhere(model)));
                 rms(drawn.iter().zip(&compared).map(|(y, p)| y - p))
             }
             Ok(None) | Err(_) => stated,
@@ -490,7 +474,7 @@ impl<'a> Workbench<'a> {
             return 0.0;
         }
         let steady = self.problem.driven_by(self.steady.clone());
-        let steady = self.run_on(&self.chain(&steady), model);
+        let steady = self.run_on(&self.chain_of(&steady), model);
         let moves = |noise: &[f64]| -> f64 {
             let each = self.standstills.iter().map(|rows| {
                 let noise = &noise[rows.clone()];
@@ -633,7 +617,7 @@ impl<'a> Workbench<'a> {
     }
 
     /// The simulation of another problem with the same readings, as far as this one's goes.
-    pub(super) fn chain<'b>(&self, problem: &'b Problem) -> Chain<'b> {
+    pub(super) fn chain_of<'b>(&self, problem: &'b Problem) -> Chain<'b> {
         ahead_of(self.censored.as_ref(), Chain::new(problem))
     }
 
@@ -665,13 +649,17 @@ impl<'a> Workbench<'a> {
             })
     }
 
-    fn thinned(&self, all: Vec<f64>) -> Vec<f64> {
-        let here = if self.rows.len() == all.len() {
+    /// A series over every observed row, at the rows that count.
+    fn at_rows(&self, all: Vec<f64>) -> Vec<f64> {
+        if self.rows.len() == all.len() {
             all
         } else {
             self.rows.iter().map(|&row| all[row]).collect()
-        };
-        let mut here = self.as_compared(here);
+        }
+    }
+
+    fn thinned(&self, all: Vec<f64>) -> Vec<f64> {
+        let mut here = self.as_compared(self.at_rows(all));
         if self.is_white() {
             // Beyond the drive's ends nothing is known: the reading stands there, and says nothing.
             for (value, y) in here.iter_mut().zip(&self.y) {
@@ -713,6 +701,15 @@ impl<'a> Workbench<'a> {
                 matches!(member.effect.card().stage, Stage::Filter | Stage::Converter)
             })
     }
+}
+
+/// A simulation at every observed row, with white noise of a standard deviation ahead of the end of its chain.
+fn with_noise(chain: &Chain<'_>, model: &Model, deviation: f64, seed: u64) -> Vec<f64> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut noise = StandardNormal
+        .sample_iter(&mut random)
+        .map(|value: f64| deviation * value);
+    chain.run_with_noise(&members(model), &model.nuisance, Some(&mut noise))
 }
 
 /// A simulation that stops short of what censors, if something does.
