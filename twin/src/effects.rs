@@ -3,6 +3,7 @@
 //! An effect is a change of the simulation by few parameters; at their nominal values it changes nothing. Adding physics
 //! is one new file and one line in [`LIBRARY`]: nothing else knows the effects by name.
 
+mod between;
 mod capacity;
 mod cell_self_heating;
 pub mod chain;

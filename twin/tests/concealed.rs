@@ -1035,3 +1035,86 @@ fn steps_that_are_cut_off_keep_their_size() {
         );
     }
 }
+
+/// Either alone is next to nothing: in the mean over the drive they cancel.
+#[test]
+fn a_gain_that_its_own_drift_hides() {
+    let tc_per_k = 0.0055;
+    let mut truth = truth();
+    let warming = truth.t_s.iter().map(|t| 31.0 + 11.0 * t / 900.0);
+    truth.temperature_c = warming.collect();
+    let pairs = || truth.current_a.iter().zip(&truth.temperature_c);
+    let (squares, drifts) = pairs().fold((0.0, 0.0), |(squares, drifts), (i, t)| {
+        (squares + i * i, drifts + i * i * tc_per_k * (t - 25.0))
+    });
+    let gain = 1.0 / (1.0 + drifts / squares);
+    let reading = pairs().map(|(i, t)| gain * i * (1.0 + tc_per_k * (t - 25.0)));
+    let report = explained(&truth, reading.collect(), 30, &[]);
+    assert_eq!(report.verdict, Verdict::Explained, "{}", report.summary);
+    assert_eq!(report.effects.len(), 2, "{}", report.summary);
+    for (id, value) in [("gain", gain), ("gain-temperature", tc_per_k)] {
+        let effect = report.effects.iter().find(|effect| effect.id == id);
+        let found = &effect.unwrap().parameters[0];
+        assert!(
+            found.ci95[0] <= value && value <= found.ci95[1],
+            "{value}: {found:?}"
+        );
+    }
+}
+
+/// What a change of range leaves behind lasts less than a row, and a late reading looks at it there.
+#[test]
+fn a_change_of_range_that_is_read_late() {
+    /// Steps of the finest grid in one of the recording.
+    const FINEST: usize = 1000;
+    let (tau_s, delay_s, ratio) = (0.02, 0.03, 10.0);
+    let mut truth = truth();
+    let step_s = STEP_S / FINEST as f64;
+    let kept = (-step_s / tau_s).exp();
+    let late = (delay_s / step_s).round() as usize;
+    let mut reading = vec![truth.current_a[0]; ROWS];
+    let (mut held, mut error, mut high) = (truth.current_a[0], 0.0, false);
+    for k in 1..(ROWS - 1) * FINEST {
+        let (row, part) = (k / FINEST, (k % FINEST) as f64 / FINEST as f64);
+        let i = truth.current_a[row] + (truth.current_a[row + 1] - truth.current_a[row]) * part;
+        held = kept * held + (1.0 - kept) * i;
+        error *= kept;
+        let now = if high {
+            i.abs() >= 51.0
+        } else {
+            i.abs() > 53.33
+        };
+        if now != high {
+            let scale = if now { ratio } else { 1.0 / ratio };
+            error = scale * (held + error) - held;
+            high = now;
+        }
+        if k % FINEST == 0 {
+            truth.high[row] = f64::from(high);
+        }
+        if (k + late).is_multiple_of(FINEST) {
+            reading[(k + late) / FINEST] = i + error;
+        }
+    }
+    truth.high[0] = 0.0;
+    truth.high[ROWS - 1] = f64::from(high);
+    let report = explained(&truth, reading, 31, &[]);
+    let found = |id: &str| {
+        let effects = report.effects.iter();
+        let named = effects.clone().find(|effect| effect.id == id);
+        named
+            .unwrap_or_else(|| panic!("{id}: {}", report.summary))
+            .parameters[0]
+            .value
+    };
+    assert!(
+        (found("range-handover") - tau_s).abs() < 0.05 * tau_s,
+        "{}",
+        report.summary
+    );
+    assert!(
+        (found("delay") - delay_s).abs() < 0.05 * delay_s,
+        "{}",
+        report.summary
+    );
+}

@@ -1,5 +1,6 @@
 //! Runs the simulation with effects, in the order of their stages.
 
+use super::between::Converter;
 use super::scene::Scene;
 use super::{Effect, Stage};
 use crate::problem::{Base, Problem, View};
@@ -281,14 +282,16 @@ impl<'a> Chain<'a> {
 
     fn apply(&self, scene: &mut Scene<'_>, link: Link<'_>, nuisance: &Nuisance) {
         match link {
-            Link::Effect(effect, values, _) => effect.apply(values, scene),
+            Link::Effect(effect, values, _) => {
+                // A counter's rails and thresholds are behind the converter.
+                if effect.card().stage > Stage::Converter {
+                    scene.onto_rows();
+                }
+                effect.apply(values, scene);
+            }
             Link::Window => {
-                let (held, drive) = (scene.held(), scene.drive);
                 let window_s = scene.sensor.map_or(0.0, |sensor| sensor.window_s);
-                scene.signal = scene
-                    .steps
-                    .boxcar(drive, &scene.signal, window_s, held)
-                    .into();
+                scene.convert(Converter::Mean { window_s });
             }
             Link::Sample => {
                 scene.delay_s +=

@@ -43,6 +43,6 @@ impl Effect for Lag {
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
-        scene.signal = scene.low_pass(&scene.signal, values[0]).into();
+        scene.low_pass(values[0]);
     }
 }

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::scene::{Cursor, Steps, area};
+use super::scene::{Cursor, Steps};
 use crate::problem::Drive;
 
 /// Rows of even steps up to which sums from the first row on are kept: they save time, and take memory in every run (8 MB of so
@@ -42,28 +42,95 @@ impl Steps {
                 first_s: drive.t_s[rows.start],
                 per_s: 1.0 / step_s,
             },
-            None => MeansOver::Any {
-                cursor: Cursor::new(&drive.t_s, rows.clone()),
-                input,
-                held,
-            },
+            None => MeansOver::Any(AnyMeans::new(&drive.t_s, rows.clone(), input, held)),
         })
     }
 }
 
 /// Boxcar mean over the `window_s` before each row; before the start of a segment the signal stood at its first value.
 fn boxcar(t_s: &[f64], input: &[f64], window_s: f64, held: bool, output: &mut [f64]) {
-    // Where the window begins (times go forward within a segment), and the integrals up to there and up to its end.
-    let mut begin = Cursor::new(t_s, 0..t_s.len());
-    let (mut before, mut until) = (0.0, 0.0);
-    for (row, out) in output.iter_mut().enumerate() {
-        if row > 0 {
-            until += area(t_s, input, row - 1, held);
+    let mut means = AnyMeans::new(t_s, 0..t_s.len(), input, held);
+    for (t, out) in t_s.iter().zip(output) {
+        *out = means.mean(t - window_s, *t);
+    }
+}
+
+/// Means over any stretches of time; of those that go forward every row is passed twice.
+struct AnyMeans<'a> {
+    /// Where a mean begins, and where it ends.
+    ends: [Running<'a>; 2],
+}
+
+impl<'a> AnyMeans<'a> {
+    fn new(t_s: &'a [f64], rows: Range<usize>, input: &'a [f64], held: bool) -> Self {
+        let running = || Running {
+            first: input[rows.start],
+            cursor: Cursor::new(t_s, rows.clone()),
+            input,
+            held,
+            sum: 0.0,
+        };
+        Self {
+            ends: [running(), running()],
         }
-        let from = t_s[row] - window_s;
-        before = begin.walk(before, input, from, held);
-        let start = before + begin.beyond(input, from, held);
-        *out = (until - start) / window_s;
+    }
+
+    #[inline]
+    fn mean(&mut self, from: f64, to: f64) -> f64 {
+        let [begin, end] = &mut self.ends;
+        let before = begin.until(from);
+        if begin.is_within_step(from, to) {
+            // Of a straight line it is the value in the middle.
+            return (begin.cursor).value(begin.input, 0.5 * (from + to), begin.held);
+        }
+        begin.first + (end.until(to) - before) / (to - from)
+    }
+}
+
+/// The integral of a signal up to a time, of what is more than its first value (so that sums stay small).
+struct Running<'a> {
+    cursor: Cursor<'a>,
+    input: &'a [f64],
+    first: f64,
+    held: bool,
+    /// Up to the row where the cursor stands.
+    sum: f64,
+}
+
+impl Running<'_> {
+    /// Beyond the ends the signal holds its end values.
+    #[inline]
+    fn until(&mut self, t: f64) -> f64 {
+        while let Some(step_s) = self.cursor.step_s()
+            && self.cursor.since_s(t) >= step_s
+        {
+            self.sum += self.area(step_s);
+            self.cursor.forward();
+        }
+        while self.cursor.since_s(t) < 0.0 && self.cursor.back() {
+            let step_s = self.cursor.step_s().unwrap_or_default();
+            self.sum -= self.area(step_s);
+        }
+        self.sum + self.cursor.beyond(self.input, t, self.held)
+            - self.first * self.cursor.since_s(t)
+    }
+
+    fn is_within_step(&self, from: f64, to: f64) -> bool {
+        let step_s = self.cursor.step_s();
+        self.cursor.since_s(from) >= 0.0
+            && step_s.is_some_and(|step_s| self.cursor.since_s(to) <= step_s)
+    }
+
+    /// Over the step where the cursor stands.
+    #[inline]
+    fn area(&self, step_s: f64) -> f64 {
+        let here = self.input[self.cursor.row()];
+        let mean = if self.held {
+            here
+        } else {
+            0.5 * (here + self.input[self.cursor.row() + 1])
+        };
+        (mean - self.first) * step_s
     }
 }
 
@@ -193,11 +260,7 @@ enum MeansOver<'a> {
         first_s: f64,
         per_s: f64,
     },
-    Any {
-        cursor: Cursor<'a>,
-        input: &'a [f64],
-        held: bool,
-    },
+    Any(AnyMeans<'a>),
 }
 
 impl Means<'_> {
@@ -210,11 +273,7 @@ impl Means<'_> {
                 first_s,
                 per_s,
             } => means.mean((from_s - *first_s) * *per_s, (to_s - *first_s) * *per_s),
-            MeansOver::Any {
-                cursor,
-                input,
-                held,
-            } => cursor.mean(input, from_s, to_s, *held),
+            MeansOver::Any(means) => means.mean(from_s, to_s),
         }
     }
 }
@@ -222,7 +281,7 @@ impl Means<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::effects::scene::tests::drive;
+    use crate::effects::scene::{integral, tests::drive};
 
     #[test]
     fn a_boxcar_follows_a_ramp_late_by_half_its_window() {
@@ -232,16 +291,42 @@ mod tests {
     }
 
     #[test]
+    fn a_mean_is_the_integral_over_its_time() {
+        // Uneven rows, two at one time.
+        let t_s: Vec<f64> = (0..60)
+            .map(|k| 0.1 * f64::from(k - k % 7 / 6) + 0.03 * f64::from(k % 3 % 2))
+            .collect();
+        let series: Vec<f64> = t_s.iter().map(|t| (3.0 * t).sin() + t).collect();
+        for held in [false, true] {
+            let total = integral(&t_s, std::slice::from_ref(&(0..60)), &series, held);
+            for (period, length) in [(0.07, 0.001), (0.05, 0.05), (0.31, 0.2), (2.0, 2.0)] {
+                let mut means = AnyMeans::new(&t_s, 0..60, &series, held);
+                let mut from = -0.4;
+                while from < 6.4 {
+                    let until = |t| Cursor::new(&t_s, 0..60).integral(&total, &series, t, held);
+                    let expected = (until(from + length) - until(from)) / length;
+                    let found = means.mean(from, from + length);
+                    assert!(
+                        (found - expected).abs() < 1e-9,
+                        "{held} {length} {from}: {found} {expected}"
+                    );
+                    from += period;
+                }
+            }
+        }
+    }
+
+    #[test]
     fn a_mean_over_even_steps_is_one_over_any() {
         let t_s: Vec<f64> = (0..60).map(|k| 5.0 + f64::from(k) * 0.01).collect();
         let input: Vec<f64> = (0..60).map(|k| 300.0 + f64::from(k * 7 % 23)).collect();
         for held in [false, true] {
             let even = EvenMeans::new(&input, held);
-            let mut any = Cursor::new(&t_s, 0..60);
+            let mut any = AnyMeans::new(&t_s, 0..60, &input, held);
             for (period, length) in [(0.007, 1e-4), (0.005, 0.005), (0.031, 0.02), (0.2, 0.2)] {
                 let mut from = -0.04;
                 while from < 0.64 {
-                    let expected = any.mean(&input, 5.0 + from, 5.0 + from + length, held);
+                    let expected = any.mean(5.0 + from, 5.0 + from + length);
                     let found = even.mean(from / 0.01, (from + length) / 0.01);
                     assert!(
                         (found - expected).abs() < 1e-7,

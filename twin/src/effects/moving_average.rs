@@ -1,5 +1,6 @@
 //! Boxcar window.
 
+use super::between::Converter;
 use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced, within_a_period};
 
@@ -44,10 +45,10 @@ impl Effect for MovingAverage {
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
-        let held = scene.held();
-        scene.signal = scene
-            .steps
-            .boxcar(scene.drive, &scene.signal, values[0], held)
-            .into();
+        if values[0] > 0.0 {
+            scene.convert(Converter::Mean {
+                window_s: values[0],
+            });
+        }
     }
 }

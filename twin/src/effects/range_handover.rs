@@ -67,53 +67,10 @@ impl Effect for RangeHandover {
         if tau_s <= 0.0 {
             return;
         }
-        let drive = scene.drive;
-        let mut changes = scene.changes.iter().peekable();
-        let held = scene.held();
-        let input = &scene.signal;
-        let mut output = input.to_vec();
-        // The low-pass over a part of a step in which its input goes from one value to another.
-        let over = |state: f64, from: f64, to: f64, h: f64| {
-            if h <= 0.0 {
-                return state;
-            }
-            let kept = (-h / tau_s).exp();
-            let ramp = if held {
-                0.0
-            } else {
-                1.0 - tau_s / h * (1.0 - kept)
-            };
-            kept * state + (1.0 - kept) * from + (to - from) * ramp
-        };
-        for rows in drive.segments.iter().filter(|rows| !rows.is_empty()) {
-            // Error of the product in the low-pass, in the scale of the range in use.
-            let mut error = 0.0;
-            let mut plain = input[rows.start];
-            for row in rows.start + 1..rows.end {
-                let h = (drive.t_s[row] - drive.t_s[row - 1]).max(0.0);
-                // What the low-pass holds is read at another scale from each change on.
-                let (mut done, mut here) = (0.0, input[row - 1]);
-                while let Some(change) = changes.next_if(|change| change.row <= row) {
-                    let part = (h - change.since_s - done).max(0.0);
-                    done += part;
-                    let there = if h > 0.0 {
-                        input[row - 1] + (input[row] - input[row - 1]) * (done / h)
-                    } else {
-                        input[row]
-                    };
-                    plain = over(plain, here, there, part);
-                    error *= (-part / tau_s).exp();
-                    let scale = if change.high { ratio } else { 1.0 / ratio };
-                    error = scale * (plain + error) - plain;
-                    here = there;
-                }
-                plain = over(plain, here, input[row], h - done);
-                if error != 0.0 {
-                    error *= (-(h - done) / tau_s).exp();
-                }
-                output[row] += error;
-            }
-        }
-        scene.signal = output.into();
+        // What the low-pass holds is read at another scale from each change on.
+        scene.decay_from_changes(tau_s, |plain, decayed, high| {
+            let scale = if high { ratio } else { 1.0 / ratio };
+            scale * (plain + decayed) - plain
+        });
     }
 }

@@ -1,5 +1,6 @@
 //! Only a part of each period is measured.
 
+use super::between::Converter;
 use super::scene::{Scale, Scene, floored};
 use crate::spectrum;
 
@@ -135,37 +136,11 @@ impl Effect for SampledWindow {
         if period <= 0.0 {
             return;
         }
-        let per_s = 1.0 / period;
-        let drive = scene.drive;
-        let held = scene.held();
-        let input = &scene.signal[..];
-        let mut output = input.to_vec();
-        // The converter goes on while nothing is recorded: what flowed then is a straight line.
-        for rows in drive.operations().iter().filter(|rows| !rows.is_empty()) {
-            let start = drive.t_s[rows.start] + phase;
-            let mut means = scene.steps.means(drive, rows, input, held);
-            let (mut value, mut until) = (input[rows.start], f64::NEG_INFINITY);
-            let mut known = f64::NAN;
-            for (out, t) in output[rows.clone()]
-                .iter_mut()
-                .zip(&drive.t_s[rows.clone()])
-            {
-                let elapsed = t - start;
-                // Well before the next window ends there is nothing to ask.
-                if elapsed.is_nan() || elapsed >= until {
-                    // The newest window that has ended.
-                    let ended = floored((elapsed - duty * period) * per_s);
-                    until = (ended + 1.0 - 1e-6) * period + duty * period;
-                    if ended >= 0.0 && ended != known {
-                        known = ended;
-                        let from = start + ended * period;
-                        value = means.mean(from, from + duty * period);
-                    }
-                }
-                *out = value;
-            }
-        }
-        scene.signal = output.into();
+        scene.convert(Converter::Windows {
+            period_s: period,
+            duty,
+            phase_s: phase,
+        });
     }
 }
 

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
 
+use super::between::Between;
 use crate::problem::{
     Base, BatteryBase, Drive, Moments, Observed, Problem, SensorBase, Series, View,
 };
@@ -71,6 +72,8 @@ pub struct Scene<'a> {
     pub changes: Arc<Vec<RangeChange>>,
     /// The signal: on drive rows before [`super::Stage::Ripple`], then on the observation's rows.
     pub signal: Series,
+    /// What it does between drive rows.
+    pub(super) between: Between,
     /// Transport delay in s.
     pub delay_s: f64,
     /// The sensor's clock runs fast by this, in 1.
@@ -397,7 +400,7 @@ impl Steps {
 
 /// Integral over the step that begins at a row: a trapezoid, or the value held.
 #[inline]
-pub(super) fn area(t_s: &[f64], input: &[f64], row: usize, held: bool) -> f64 {
+fn area(t_s: &[f64], input: &[f64], row: usize, held: bool) -> f64 {
     let mean = if held {
         input[row]
     } else {
@@ -443,9 +446,36 @@ impl<'a> Cursor<'a> {
         Self { t_s, rows, at }
     }
 
+    /// The row where it stands.
+    pub(super) fn row(&self) -> usize {
+        self.at
+    }
+
+    /// Goes on by a row.
+    pub(super) fn forward(&mut self) {
+        self.at += 1;
+    }
+
+    /// Goes back by a row; whether there was one.
+    pub(super) fn back(&mut self) -> bool {
+        let is_there = self.at > self.rows.start;
+        self.at -= usize::from(is_there);
+        is_there
+    }
+
+    /// Time from there to another, in s.
+    pub(super) fn since_s(&self, t: f64) -> f64 {
+        t - self.t_s[self.at]
+    }
+
+    /// From there to the next row, in s; nothing at the end.
+    pub(super) fn step_s(&self) -> Option<f64> {
+        (self.at + 1 < self.rows.end).then(|| self.t_s[self.at + 1] - self.t_s[self.at])
+    }
+
     /// Moves so that `at` is the last row not after `t`.
     #[inline]
-    fn seek(&mut self, t: f64) {
+    pub(super) fn seek(&mut self, t: f64) {
         while self.at > self.rows.start && self.t_s[self.at] > t {
             self.at -= 1;
         }
@@ -472,29 +502,6 @@ impl<'a> Cursor<'a> {
     pub fn integral(&mut self, integral: &[f64], series: &[f64], t: f64, held: bool) -> f64 {
         self.seek(t);
         integral[self.at] + self.beyond(series, t, held)
-    }
-
-    /// Mean from one time to a later one. The cursor ends where that ends: over times that go forward every row is passed once.
-    #[inline]
-    pub fn mean(&mut self, series: &[f64], from: f64, to: f64, held: bool) -> f64 {
-        self.seek(from);
-        let at = self.at;
-        if from >= self.t_s[at] && at + 1 < self.rows.end && to <= self.t_s[at + 1] {
-            // Of a straight line it is the value in the middle.
-            return self.value(series, 0.5 * (from + to), held);
-        }
-        let sum = self.walk(-self.beyond(series, from, held), series, to, held);
-        (sum + self.beyond(series, to, held)) / (to - from)
-    }
-
-    /// Goes on to the last row not after a time; a sum, with the integral over what was passed.
-    #[inline]
-    pub(super) fn walk(&mut self, mut sum: f64, series: &[f64], t: f64, held: bool) -> f64 {
-        while self.at + 1 < self.rows.end && self.t_s[self.at + 1] <= t {
-            sum += area(self.t_s, series, self.at, held);
-            self.at += 1;
-        }
-        sum
     }
 
     /// Integral from the row where the cursor stands to a time before the next one, or beyond the ends.
@@ -595,6 +602,7 @@ impl<'a> Scene<'a> {
             on_rows: Arc::new(on_rows(drive, &problem.observed)),
             changes: Arc::new(range_changes(drive, sensor)),
             signal: drive.reference.clone(),
+            between: Between::default(),
             delay_s: 0.0,
             skew: 0.0,
             sensor,
@@ -613,17 +621,16 @@ impl<'a> Scene<'a> {
         self.steps.low_pass(&operations, input, tau_s, self.held())
     }
 
-    /// First-order low-pass of the scene's own signal.
-    pub fn low_pass(&self, input: &[f64], tau_s: f64) -> Vec<f64> {
-        self.steps
-            .low_pass(&self.drive.segments, input, tau_s, self.held())
-    }
-
     /// From drive rows to the observation's rows.
     pub fn sample(&mut self, view: View) {
         let drive = self.drive;
         let observed = self.observed;
         let shifted = self.delay_s != 0.0 || self.skew != 0.0;
+        let on_rows = !shifted && !matches!(observed.moments, Moments::Own);
+        // The signal is asked for where it is known already, or from row to row.
+        if on_rows || view == View::Charge {
+            self.onto_rows();
+        }
         if !shifted && view != View::Charge {
             match &observed.moments {
                 Moments::EveryRow => return,
@@ -641,6 +648,8 @@ impl<'a> Scene<'a> {
         let (skew, delay_s) = (1.0 + self.skew, self.delay_s);
         let mut known: (usize, Option<(f64, f64)>) = (usize::MAX, None);
         let operations = drive.operation_of_each();
+        let straight = self.is_straight();
+        let mut at_rows: Option<Series> = None;
         // One stretch of readings after the other, each within one segment.
         for ((segment, these), on_rows) in observed.stretches.iter().zip(self.on_rows.iter()) {
             let rows = drive.segments.get(segment).cloned();
@@ -662,8 +671,7 @@ impl<'a> Scene<'a> {
             let ends_s = [drive.t_s[rows.start], drive.t_s[rows.end - 1]];
             let is_ahead = |t: f64| operation.start < rows.start && t < ends_s[0];
             let is_behind = |t: f64| rows.end < operation.end && t > ends_s[1];
-            let signal = &self.signal;
-            let mut at = |t: f64| {
+            let mut at = |signal: &[f64], t: f64| {
                 if skew != 1.0 && (is_ahead(t) || is_behind(t)) {
                     f64::NAN
                 } else {
@@ -672,6 +680,17 @@ impl<'a> Scene<'a> {
             };
             let times = &observed.t_s[these.clone()];
             let values = &mut sampled[these.clone()];
+            if !straight {
+                self.at(segment, times, reference_s, values);
+                let shifted = times.iter().map(|t| reference_s(*t));
+                for (value, t) in values.iter_mut().zip(shifted) {
+                    if is_ahead(t) || is_behind(t) {
+                        let at_rows = at_rows.get_or_insert_with(|| self.at_rows());
+                        *value = at(at_rows, t);
+                    }
+                }
+                continue;
+            }
             // Rows of even steps: all of them move by the same part of a step.
             if let Some(Some(step_s)) = self.steps.even_s.get(segment)
                 && (*on_rows && !held && total.is_none())
@@ -688,16 +707,16 @@ impl<'a> Scene<'a> {
                 let ahead = (times.iter().zip(values.iter_mut()))
                     .map(|(t, value)| (reference_s(*t), value))
                     .take_while(|(t, _)| is_ahead(*t));
-                ahead.for_each(|(t, value)| *value = at(t));
+                ahead.for_each(|(t, value)| *value = at(&self.signal, t));
                 let behind = (times.iter().zip(values.iter_mut()).rev())
                     .map(|(t, value)| (reference_s(*t), value))
                     .take_while(|(t, _)| is_behind(*t));
-                behind.for_each(|(t, value)| *value = at(t));
+                behind.for_each(|(t, value)| *value = at(&self.signal, t));
                 continue;
             }
             let Some(total) = &total else {
                 for (value, t) in values.iter_mut().zip(times) {
-                    *value = at(reference_s(*t));
+                    *value = at(&self.signal, reference_s(*t));
                 }
                 continue;
             };
@@ -719,6 +738,14 @@ impl<'a> Scene<'a> {
             }
         }
         self.signal = sampled.into();
+        self.between = Between::default();
+    }
+
+    /// What the signal is at the drive's rows, once everything has looked at it.
+    fn at_rows(&self) -> Series {
+        let mut scene = self.clone();
+        scene.onto_rows();
+        scene.signal
     }
 }
 
@@ -900,32 +927,6 @@ pub(super) mod tests {
         let t_s: Vec<f64> = (0..2000).map(|k| f64::from(k) * 0.01).collect();
         let output = Steps::new(&drive(&t_s)).low_pass(&[0..2000], &t_s, 0.5, false);
         assert!((output[1999] - (t_s[1999] - 0.5)).abs() < 1e-9);
-    }
-
-    #[test]
-    fn a_mean_is_the_integral_over_its_time() {
-        // Uneven rows, two at one time.
-        let t_s: Vec<f64> = (0..60)
-            .map(|k| 0.1 * f64::from(k - k % 7 / 6) + 0.03 * f64::from(k % 3 % 2))
-            .collect();
-        let series: Vec<f64> = t_s.iter().map(|t| (3.0 * t).sin() + t).collect();
-        for held in [false, true] {
-            let total = integral(&t_s, &[0..60], &series, held);
-            for (period, length) in [(0.07, 0.001), (0.05, 0.05), (0.31, 0.2), (2.0, 2.0)] {
-                let mut mean = Cursor::new(&t_s, 0..60);
-                let mut from = -0.4;
-                while from < 6.4 {
-                    let until = |t| Cursor::new(&t_s, 0..60).integral(&total, &series, t, held);
-                    let expected = (until(from + length) - until(from)) / length;
-                    let found = mean.mean(&series, from, from + length, held);
-                    assert!(
-                        (found - expected).abs() < 1e-9,
-                        "{held} {length} {from}: {found} {expected}"
-                    );
-                    from += period;
-                }
-            }
-        }
     }
 
     #[test]
