@@ -25,6 +25,8 @@ pub const DRAWS: usize = 200;
 const MOST_ROWS: usize = 30_000;
 /// Starts of an effect that are compared with placebos, by each of two measures.
 const MOST_STARTS: usize = 8;
+/// Two effects hide each other if either alone takes less than this share of what both do.
+const HIDDEN: f64 = 0.5;
 /// A residual moved to where a candidate looks like itself again is no placebo for it: signs are drawn then.
 pub const ITSELF: f64 = 0.6;
 
@@ -90,6 +92,65 @@ pub struct Screening {
     pub entries: Vec<Entry>,
     /// 99th percentile of the placebos' best gains.
     pub placebo_p99: f64,
+    /// Squared error of the residual that they are compared with.
+    energy: f64,
+}
+
+impl Screening {
+    /// Of some entries those pairs that hide each other, at most so many, the best first: together they take at least a share of all of
+    /// the error, and each alone less than half of what both do.
+    pub fn hidden<'e>(
+        &self,
+        entries: &[&'e Entry],
+        least: f64,
+        most: usize,
+    ) -> Vec<[&'e Entry; 2]> {
+        let alone: Vec<f64> = (entries.iter())
+            .map(|entry| entry.folds.taken(&entry.rights))
+            .collect();
+        let other = |a: usize, b: usize| {
+            let [a, b] = [a, b].map(|k| entries[k].member.id());
+            a != b
+        };
+        let mut pairs: Vec<(f64, [usize; 2])> = (0..entries.len())
+            .into_par_iter()
+            .flat_map_iter(|b| (0..b).filter(move |a| other(*a, b)).map(move |a| [a, b]))
+            .filter_map(|[a, b]| {
+                let both = taken_together(entries[a], entries[b]);
+                let hidden = both >= least * self.energy && alone[a].max(alone[b]) < HIDDEN * both;
+                hidden.then_some((both, [a, b]))
+            })
+            .collect();
+        pairs.sort_by(|one, other| other.0.total_cmp(&one.0));
+        let mut forms = Vec::new();
+        let mut found = Vec::new();
+        for (_, pair) in pairs {
+            let pair = pair.map(|k| entries[k]);
+            let these = pair.map(|entry| entry.member.form());
+            if !forms.contains(&these) && found.len() < most {
+                forms.push(these);
+                found.push(pair);
+            }
+        }
+        found
+    }
+}
+
+/// What the columns of two entries take together, nothing held out.
+fn taken_together(one: &Entry, other: &Entry) -> f64 {
+    let columns: Vec<&Vec<f64>> = one.columns.iter().chain(&other.columns).collect();
+    let size = columns.len();
+    let gram = DMatrix::from_fn(size, size, |a, b| dot(columns[a], columns[b]));
+    let sums = one.folds.all(&one.rights);
+    let sums = sums
+        .iter()
+        .chain(other.folds.all(&other.rights).iter())
+        .copied()
+        .collect::<Vec<_>>();
+    let sums = DVector::from_vec(sums);
+    let mut factors = sums.clone();
+    Solver::new(&gram, 1e-9).solve(&mut factors);
+    factors.dot(&sums)
 }
 
 /// Rows of a thinned bench, and its blocks in them.
@@ -247,6 +308,7 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
     Screening {
         entries,
         placebo_p99,
+        energy: all,
     }
 }
 
@@ -642,8 +704,39 @@ fn placebos(
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+    use crate::explain::fit::fit;
+    use crate::problem::Problem;
+
+    /// A gain and its drift that cancel in the mean.
+    #[test]
+    fn two_that_hide_each_other_are_found_together() {
+        let t_s: Vec<f64> = (0..2000).map(|k| 0.1 * f64::from(k)).collect();
+        let current: Vec<f64> = t_s.iter().map(|t| 100.0 * (1.7 * t).sin()).collect();
+        let warmer: Vec<f64> = t_s.iter().map(|t| 0.05 * (t - 100.0)).collect();
+        let drifting = |gain: f64| -> Vec<f64> {
+            let factors = warmer.iter().map(|k| gain + 0.004 * k);
+            factors.zip(&current).map(|(gain, i)| gain * i).collect()
+        };
+        let found = |reading: Vec<f64>| {
+            let mut problem = Problem::pair(t_s.clone(), current.clone(), reading, 0.5);
+            let temperature_c = warmer.iter().map(|k| 35.0 + k);
+            problem.drive.sensor_temperature_c = Some(temperature_c.collect());
+            let bench = Workbench::new(&problem, &[]);
+            let screening = screen(&bench, &fit(&bench, &Model::default(), None), 0, 0);
+            let entries: Vec<&Entry> = screening.entries.iter().collect();
+            let pairs = screening.hidden(&entries, 0.5, 4);
+            let mut ids = pairs.iter().map(|pair| pair.map(|entry| entry.member.id()));
+            ids.any(|pair| {
+                pair == ["gain", "gain-temperature"] || pair == ["gain-temperature", "gain"]
+            })
+        };
+        assert!(found(drifting(1.0)));
+        // Of this one of them takes most by itself.
+        assert!(!found(drifting(1.1)));
+    }
 
     #[test]
     fn products_are_those_of_moved_residuals() {

@@ -17,6 +17,8 @@ const TRIED: usize = 4;
 const FIRSTS: usize = 5;
 /// Pairs that are looked at, best first.
 const PAIRS: usize = 6;
+/// Pairs that hide each other that are looked at besides.
+const HIDDEN: usize = 4;
 /// Starts of each that are fitted.
 pub(super) const STARTS: usize = 2;
 /// Candidates that are fitted besides, because they take most of the error with its outliers.
@@ -45,8 +47,8 @@ pub(super) fn addition(
         .iter()
         .partition(|entry| entry.member.effect.remembers());
     let all: Vec<&Entry> = screening.entries.iter().collect();
-    let p99 = screening.placebo_p99;
-    let mut grown = |entries: &[&Entry]| added_of(bench, now, (entries, p99), decisions, refused);
+    let mut grown =
+        |entries: &[&Entry]| added_of(bench, now, (entries, screening), decisions, refused);
     grown(&plain).or_else(|| (!free.is_empty()).then(|| grown(&all)).flatten())
 }
 
@@ -54,10 +56,11 @@ pub(super) fn addition(
 fn added_of(
     bench: &Workbench<'_>,
     now: &Fit,
-    (entries, p99): (&[&Entry], f64),
+    (entries, screening): (&[&Entry], &Screening),
     decisions: &mut Vec<String>,
     refused: &mut Vec<String>,
 ) -> Option<(Fit, f64)> {
+    let p99 = screening.placebo_p99;
     let (mut said, mut said_besides) = (Vec::new(), Vec::new());
     let usual = promising(bench, now, entries, FITTED, STARTS);
     let single = step(bench, now, usual, p99, &mut said, refused);
@@ -65,7 +68,7 @@ fn added_of(
     // whenever nothing passes alone.
     let double = if now.model.members.is_empty() || single.is_none() {
         let single = single.as_ref().map(|(fit, _)| fit);
-        pair(bench, now, (entries, p99), single, &mut said, refused)
+        pair(bench, now, (entries, screening), single, &mut said, refused)
     } else {
         None
     };
@@ -255,7 +258,7 @@ fn note(list: &mut Vec<String>, text: String) {
 fn pair(
     bench: &Workbench<'_>,
     now: &Fit,
-    (entries, placebo_p99): (&[&Entry], f64),
+    (entries, screening): (&[&Entry], &Screening),
     single: Option<&Fit>,
     decisions: &mut Vec<String>,
     refused: &mut Vec<String>,
@@ -267,13 +270,14 @@ fn pair(
     if now.model.members.len() + 2 > MOST_EFFECTS {
         return None;
     }
+    let placebo_p99 = screening.placebo_p99;
     let least = pairs_gain(placebo_p99);
     // Free forms are among the second ones where they are among the first.
     let free = entries.iter().any(|entry| entry.member.effect.remembers());
     let may_follow = |entry: &Entry| free || !entry.member.effect.remembers();
     // A masked effect shows once the other is fitted: from each of the best single ones one goes a step further.
     let firsts = promising(bench, now, entries, FIRSTS, 1);
-    let models: Vec<Model> = fits(bench, firsts)
+    let mut models: Vec<Model> = fits(bench, firsts)
         .par_iter()
         .flat_map_iter(|first| {
             let taken = share(bench, now, first).max(0.0);
@@ -287,6 +291,16 @@ fn pair(
         // One more branch of the first is no second effect.
         .filter(|model| model.members.len() == now.model.members.len() + 2)
         .collect();
+    // Of two that hide each other well, neither is among the best single ones.
+    let told: Vec<&Entry> = (entries.iter().copied())
+        .filter(|entry| !endless(bench, &entry.member))
+        .collect();
+    let hidden = screening.hidden(&told, least, HIDDEN);
+    models.extend(hidden.into_iter().filter_map(|pair| {
+        let [first, second] = pair.map(|entry| entry.member.clone());
+        let model = added(&added(&now.model, first), second);
+        (model.members.len() == now.model.members.len() + 2).then_some(model)
+    }));
     let (ranked, _) = ranked(bench, now, models);
     let best = ranked
         .into_iter()
