@@ -1,7 +1,7 @@
 //! Why an effect that fits is not named: too small, within what is accurate, or at the end of what is physics.
 
 use super::percent;
-use crate::effects::Search;
+use crate::effects::{Effect, Search, Stage};
 use crate::explain::fit::Fit;
 use crate::explain::normal::dot;
 use crate::explain::robust::huber;
@@ -69,7 +69,7 @@ pub(super) fn small(
         return Some("changes nothing".into());
     }
     let there = 1.0 - to / f64::max(from, 1e-300);
-    if cut(&after.model, index) && chance(&before.residual, &after.residual) {
+    if jumps(&after.model, index) && chance(&before.residual, &after.residual) {
         return Some("shown only by readings that noise takes over the other's threshold".into());
     }
     if member.effect.remembers() {
@@ -79,7 +79,7 @@ pub(super) fn small(
             return Some("what it remembers shows no more than by chance beside a curve".into());
         }
     }
-    let (gain, there) = if bench.is_white() || cut(&after.model, index) {
+    let (gain, there) = if bench.is_white() || jumps(&after.model, index) {
         size_beside(bench, &before.residual, &after.model, index)
     } else {
         (gain, there)
@@ -138,10 +138,11 @@ fn within_others(rms: f64, others: f64, unit: &str) -> String {
     )
 }
 
-/// Whether another effect cuts or rounds what one gives.
-fn cut(model: &Model, index: usize) -> bool {
+/// Whether noise that takes what one effect gives over an edge of another one makes readings jump: at a rail nothing jumps.
+fn jumps(model: &Model, index: usize) -> bool {
     let mut others = model.members.iter().enumerate();
-    others.any(|(other, member)| other != index && member.effect.cuts())
+    let at_an_edge = |effect: &dyn Effect| effect.cuts() && effect.card().stage != Stage::Rail;
+    others.any(|(other, member)| other != index && at_an_edge(member.effect))
 }
 
 /// Whether single readings make up a gain: the sum of what their squared errors fall by is less than so many times the root of
