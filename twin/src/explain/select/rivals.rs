@@ -7,7 +7,7 @@ use super::losses::{beaten, losses, share};
 use super::obstacle::{apart, at_end, beside, obstacle, only_aligns, small};
 use super::{Named, percent};
 use crate::effects::{Effect, find};
-use crate::explain::fit::{Fit, fit};
+use crate::explain::fit::{Fit, elsewhere, fit};
 use crate::explain::quieter::only_quietens;
 use crate::explain::robust::loss;
 use crate::explain::screen::screen;
@@ -188,14 +188,17 @@ pub(super) fn plainer(
                         exact(member)
                             && one.equivalent.contains(&member.id())
                             && at_end(bench, member).is_none()
-                    }) && !beaten(bench, fit, now)
+                    })
                 })
+                // As was done with what it is compared with.
+                .map(|fit| elsewhere(bench, fit.clone()))
+                .filter(|fit| !beaten(bench, fit, now))
                 // In one spread for all: in its own, a bad fit's residual is a small one.
                 .min_by(|a, b| {
                     let sigma = a.sigma.min(b.sigma);
                     loss(&a.residual, sigma).total_cmp(&loss(&b.residual, sigma))
                 })
-                .map(|fit| (one.index, fit.clone()))
+                .map(|fit| (one.index, fit))
         })
 }
 
