@@ -55,7 +55,11 @@ fn leave_nothing() -> io::Result<()> {
             } else {
                 ""
             };
-            eprintln!("{clear}error: interrupted: nothing was written");
+            // Who reads this may have been ended first.
+            let _ = writeln!(
+                io::stderr(),
+                "{clear}error: interrupted: nothing was written"
+            );
             // What a shell makes of a signal.
             std::process::exit(128 + signal);
         }
