@@ -4,7 +4,6 @@
 //! there, and averages and late clocks look there: what one of them makes is no straight line to the next. So a signal is its values
 //! at the rows and how it bends between them, both exact, and a converter waits until it is known at which times it is asked.
 
-use std::ops::Range;
 use std::sync::Arc;
 
 use super::means::Means;
@@ -221,7 +220,7 @@ impl<'s> Course<'s> {
             None => &scene.signal[..],
         };
         let means = between.converter.is_some();
-        let means = means.then(|| scene.steps.means(drive, &rows, lines, held));
+        let means = means.then(|| scene.steps.means(drive, segment, lines, held));
         let cursor = Cursor::new(&drive.t_s, rows);
         let decays = between.decays.iter().map(|decay| Decaying {
             tau_s: decay.tau_s,
@@ -444,7 +443,7 @@ impl Scene<'_> {
             }) => {
                 let drive = self.drive;
                 let rows = &drive.segments[segment];
-                let operation = operation_of(&drive.operations(), rows);
+                let operation = self.operations[segment].clone();
                 let start = drive.t_s[operation.start] + phase_s;
                 // What is recorded, and what is held before and after an operation.
                 let recorded = |from_s: f64, to_s: f64| {
@@ -469,8 +468,8 @@ impl Scene<'_> {
                                 course.mean(from, to)
                             } else {
                                 let lines = lines.get_or_insert_with(|| {
-                                    let held = self.held();
-                                    self.steps.means(drive, &operation, &self.signal, held)
+                                    let (operation, at) = (operation.clone(), rows.start);
+                                    Means::around(drive, operation, at, &self.signal, self.held())
                                 });
                                 lines.mean(from, to)
                             };
@@ -481,12 +480,6 @@ impl Scene<'_> {
             }
         }
     }
-}
-
-/// The operation that a segment is a part of.
-fn operation_of(operations: &[Range<usize>], rows: &Range<usize>) -> Range<usize> {
-    let at = operations.partition_point(|operation| operation.end <= rows.start);
-    operations.get(at).cloned().unwrap_or_else(|| rows.clone())
 }
 
 #[cfg(test)]

@@ -26,30 +26,36 @@ impl Steps {
         output
     }
 
-    /// Means of a signal over stretches of an operation; its rows are not to be none.
+    /// Means of a signal over stretches of a segment, which is not to be empty.
     pub fn means<'a>(
         &self,
         drive: &'a Drive,
-        rows: &Range<usize>,
+        segment: usize,
         input: &'a [f64],
         held: bool,
     ) -> Means<'a> {
-        let segment = drive.segments.iter().position(|segment| segment == rows);
-        let segment = segment.filter(|_| rows.len() <= SUMMED);
-        Means(match segment.and_then(|segment| self.even_s[segment]) {
+        let rows = drive.segments[segment].clone();
+        let even_s = self.even_s[segment].filter(|_| rows.len() <= SUMMED);
+        Means(match even_s {
             Some(step_s) => MeansOver::Even {
                 means: EvenMeans::new(&input[rows.clone()], held),
                 first_s: drive.t_s[rows.start],
                 per_s: 1.0 / step_s,
             },
-            None => MeansOver::Any(AnyMeans::new(&drive.t_s, rows.clone(), input, held)),
+            None => MeansOver::Any(AnyMeans::new(
+                &drive.t_s,
+                rows.clone(),
+                rows.start,
+                input,
+                held,
+            )),
         })
     }
 }
 
 /// Boxcar mean over the `window_s` before each row; before the start of a segment the signal stood at its first value.
 fn boxcar(t_s: &[f64], input: &[f64], window_s: f64, held: bool, output: &mut [f64]) {
-    let mut means = AnyMeans::new(t_s, 0..t_s.len(), input, held);
+    let mut means = AnyMeans::new(t_s, 0..t_s.len(), 0, input, held);
     for (t, out) in t_s.iter().zip(output) {
         *out = means.mean(t - window_s, *t);
     }
@@ -62,10 +68,11 @@ struct AnyMeans<'a> {
 }
 
 impl<'a> AnyMeans<'a> {
-    fn new(t_s: &'a [f64], rows: Range<usize>, input: &'a [f64], held: bool) -> Self {
+    /// Over some rows; a cursor stands at one of them at first.
+    fn new(t_s: &'a [f64], rows: Range<usize>, at: usize, input: &'a [f64], held: bool) -> Self {
         let running = || Running {
-            first: input[rows.start],
-            cursor: Cursor::new(t_s, rows.clone()),
+            first: input[at],
+            cursor: Cursor::within(t_s, rows.clone(), at),
             input,
             held,
             sum: 0.0,
@@ -87,7 +94,7 @@ impl<'a> AnyMeans<'a> {
     }
 }
 
-/// The integral of a signal up to a time, of what is more than its first value (so that sums stay small).
+/// The integral of a signal from a row to a time, of what is more than its value there (so that sums stay small).
 struct Running<'a> {
     cursor: Cursor<'a>,
     input: &'a [f64],
@@ -263,7 +270,20 @@ enum MeansOver<'a> {
     Any(AnyMeans<'a>),
 }
 
-impl Means<'_> {
+impl<'a> Means<'a> {
+    /// Over rows that follow each other, beginning to look at one of them; what is between two of them is a straight line, or held.
+    pub fn around(
+        drive: &'a Drive,
+        rows: Range<usize>,
+        at: usize,
+        input: &'a [f64],
+        held: bool,
+    ) -> Self {
+        Self(MeansOver::Any(AnyMeans::new(
+            &drive.t_s, rows, at, input, held,
+        )))
+    }
+
     /// Mean from one time to a later one, in s; beyond the ends the signal holds its end values.
     #[inline]
     pub fn mean(&mut self, from_s: f64, to_s: f64) -> f64 {
@@ -300,7 +320,7 @@ mod tests {
         for held in [false, true] {
             let total = integral(&t_s, std::slice::from_ref(&(0..60)), &series, held);
             for (period, length) in [(0.07, 0.001), (0.05, 0.05), (0.31, 0.2), (2.0, 2.0)] {
-                let mut means = AnyMeans::new(&t_s, 0..60, &series, held);
+                let mut means = AnyMeans::new(&t_s, 0..60, 0, &series, held);
                 let mut from = -0.4;
                 while from < 6.4 {
                     let until = |t| Cursor::new(&t_s, 0..60).integral(&total, &series, t, held);
@@ -322,7 +342,7 @@ mod tests {
         let input: Vec<f64> = (0..60).map(|k| 300.0 + f64::from(k * 7 % 23)).collect();
         for held in [false, true] {
             let even = EvenMeans::new(&input, held);
-            let mut any = AnyMeans::new(&t_s, 0..60, &input, held);
+            let mut any = AnyMeans::new(&t_s, 0..60, 0, &input, held);
             for (period, length) in [(0.007, 1e-4), (0.005, 0.005), (0.031, 0.02), (0.2, 0.2)] {
                 let mut from = -0.04;
                 while from < 0.64 {

@@ -68,6 +68,8 @@ pub struct Scene<'a> {
     pub steps: Arc<Steps>,
     /// Of each stretch of readings, whether they were taken at the recorded rows of their segment.
     on_rows: Arc<Vec<bool>>,
+    /// Of each segment of the drive, the operation that it is a part of.
+    pub(super) operations: Arc<Vec<Range<usize>>>,
     /// Changes of the range, in order.
     pub changes: Arc<Vec<RangeChange>>,
     /// The signal: on drive rows before [`super::Stage::Ripple`], then on the observation's rows.
@@ -441,8 +443,8 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Over an operation, from a row of it on.
-    fn within(t_s: &'a [f64], rows: Range<usize>, at: usize) -> Self {
+    /// Over some rows, from one of them on.
+    pub(super) fn within(t_s: &'a [f64], rows: Range<usize>, at: usize) -> Self {
         Self { t_s, rows, at }
     }
 
@@ -600,6 +602,7 @@ impl<'a> Scene<'a> {
             observed: &problem.observed,
             steps: Arc::new(Steps::new(drive)),
             on_rows: Arc::new(on_rows(drive, &problem.observed)),
+            operations: Arc::new(drive.operation_of_each()),
             changes: Arc::new(range_changes(drive, sensor)),
             signal: drive.reference.clone(),
             between: Between::default(),
@@ -647,7 +650,6 @@ impl<'a> Scene<'a> {
         let mut sampled = vec![f64::NAN; observed.t_s.len()];
         let (skew, delay_s) = (1.0 + self.skew, self.delay_s);
         let mut known: (usize, Option<(f64, f64)>) = (usize::MAX, None);
-        let operations = drive.operation_of_each();
         let straight = self.is_straight();
         let mut at_rows: Option<Series> = None;
         // One stretch of readings after the other, each within one segment.
@@ -658,7 +660,7 @@ impl<'a> Scene<'a> {
             };
             // A clock runs on while nothing is recorded. What one of another rate points to in a gap nobody knows; what is late by
             // a constant time lies there on a straight line between the gap's ends.
-            let operation = operations[segment].clone();
+            let operation = self.operations[segment].clone();
             let start = drive.t_s[operation.start];
             // What the sensor's clock calls t was at this time.
             let reference_s = |t: f64| start + (t - start) / skew - delay_s;
