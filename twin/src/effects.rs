@@ -2,6 +2,9 @@
 //!
 //! An effect is a change of the simulation by few parameters; at their nominal values it changes nothing. Adding physics
 //! is one new file and one line in [`LIBRARY`]: nothing else knows the effects by name.
+//!
+//! `chain` runs the simulation; [`scene`] is what effects act on, `between` what a signal does between the drive's rows, `means` what it is
+//! in the mean over some time.
 
 mod between;
 mod capacity;

@@ -18,7 +18,7 @@ const FIRSTS: usize = 5;
 /// Pairs that are looked at, best first.
 const PAIRS: usize = 6;
 /// Pairs that hide each other that are looked at besides.
-const HIDDEN: usize = 4;
+const HIDDEN_PAIRS: usize = 4;
 /// Starts of each that are fitted.
 pub(super) const STARTS: usize = 2;
 /// Candidates that are fitted besides, because they take most of the error with its outliers.
@@ -295,7 +295,7 @@ fn pair(
     let told: Vec<&Entry> = (entries.iter().copied())
         .filter(|entry| !endless(bench, &entry.member))
         .collect();
-    let hidden = screening.hidden(&told, least, HIDDEN);
+    let hidden = screening.hidden(&told, least, HIDDEN_PAIRS);
     models.extend(hidden.into_iter().filter_map(|pair| {
         let [first, second] = pair.map(|entry| entry.member.clone());
         let model = added(&added(&now.model, first), second);
