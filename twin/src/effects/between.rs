@@ -209,6 +209,8 @@ struct Course<'s> {
     decays: [Vec<Decaying<'s>>; 2],
     /// Of the lines.
     means: Option<Means<'s>>,
+    /// Mean step between rows.
+    step_s: f64,
 }
 
 impl<'s> Course<'s> {
@@ -221,6 +223,8 @@ impl<'s> Course<'s> {
         };
         let means = between.converter.is_some();
         let means = means.then(|| scene.steps.means(drive, segment, lines, held));
+        let span_s = drive.t_s[rows.end - 1] - drive.t_s[rows.start];
+        let step_s = span_s / (rows.len() - 1).max(1) as f64;
         let cursor = Cursor::new(&drive.t_s, rows);
         let decays = between.decays.iter().map(|decay| Decaying {
             tau_s: decay.tau_s,
@@ -235,6 +239,7 @@ impl<'s> Course<'s> {
             cursors: [cursor.clone(), cursor],
             decays: [decays.clone(), decays],
             means,
+            step_s,
         }
     }
 
@@ -259,8 +264,9 @@ impl<'s> Course<'s> {
             return self.mean_of_signal(from_s, to_s);
         }
         // A sliding mean is a parabola between those times at which a row comes into it or goes out.
-        let row_s = self.cursors[1].step_s().unwrap_or(f64::INFINITY);
-        let parts = (PARTS * (to_s - from_s) / row_s).ceil().max(1.0);
+        let parts = (PARTS * (to_s - from_s) / self.step_s)
+            .ceil()
+            .clamp(1.0, 2.0 * PARTS * SHORT);
         let part_s = (to_s - from_s) / parts;
         let mut sum = 0.0;
         for part in 0..parts as usize {
@@ -374,21 +380,16 @@ impl Scene<'_> {
 
     /// Whether it looks at so little each time that what is ahead of it can be worked out for that.
     fn is_short(&self, converter: Converter) -> bool {
-        match converter {
-            Converter::Windows { .. } => true,
-            Converter::Mean { window_s } => {
-                let segments = self.drive.segments.iter();
-                let (span_s, steps) = segments.filter(|rows| !rows.is_empty()).fold(
-                    (0.0, 0usize),
-                    |(span_s, steps), rows| {
-                        let [first, last] =
-                            [rows.start, rows.end - 1].map(|row| self.drive.t_s[row]);
-                        (span_s + last - first, steps + rows.len() - 1)
-                    },
-                );
-                window_s * steps as f64 <= SHORT * span_s
-            }
-        }
+        let length_s = match converter {
+            Converter::Mean { window_s } => window_s,
+            Converter::Windows { period_s, duty, .. } => duty * period_s,
+        };
+        let segments = self.drive.segments.iter().filter(|rows| !rows.is_empty());
+        let (span_s, steps) = segments.fold((0.0, 0usize), |(span_s, steps), rows| {
+            let [first, last] = [rows.start, rows.end - 1].map(|row| self.drive.t_s[row]);
+            (span_s + last - first, steps + rows.len() - 1)
+        });
+        length_s * steps as f64 <= SHORT * span_s
     }
 
     /// The signal as it is at the drive's rows, with straight lines between them from here on.

@@ -292,6 +292,8 @@ impl<'a> Chain<'a> {
             Link::Window => {
                 let window_s = scene.sensor.map_or(0.0, |sensor| sensor.window_s);
                 scene.convert(Converter::Mean { window_s });
+                // What the design knows was worked out so as well.
+                scene.onto_rows();
             }
             Link::Sample => {
                 scene.delay_s +=
