@@ -243,9 +243,8 @@ impl<'s> Course<'s> {
         }
     }
 
-    /// At a time, looked up from one of the places.
-    fn value(&mut self, t: f64, place: usize) -> f64 {
-        let cursor = &mut self.cursors[place];
+    fn value(&mut self, t: f64) -> f64 {
+        let cursor = &mut self.cursors[0];
         let straight = match &self.between.low_pass {
             Some(low_pass) => {
                 cursor.seek(t);
@@ -253,7 +252,7 @@ impl<'s> Course<'s> {
             }
             None => cursor.value(self.lines, t, self.held),
         };
-        let decays = self.decays[place].iter_mut();
+        let decays = self.decays[0].iter_mut();
         straight + decays.map(|decay| decay.value(t)).sum::<f64>()
     }
 
@@ -263,7 +262,8 @@ impl<'s> Course<'s> {
         if window_s <= 0.0 {
             return self.mean_of_signal(from_s, to_s);
         }
-        // A sliding mean is a parabola between those times at which a row comes into it or goes out.
+        // A sliding mean is a parabola between those times at which a row comes into it or goes out: two points of each part (Gauss and
+        // Legendre's) are enough but next to those. Where the rows are closer than elsewhere there are no more parts for it.
         let parts = (PARTS * (to_s - from_s) / self.step_s)
             .ceil()
             .clamp(1.0, 2.0 * PARTS * SHORT);
@@ -281,7 +281,7 @@ impl<'s> Course<'s> {
 
     fn mean_of_signal(&mut self, from_s: f64, to_s: f64) -> f64 {
         let Some(means) = self.means.as_mut().filter(|_| to_s > from_s) else {
-            return self.value(to_s, 1);
+            return self.value(to_s);
         };
         let length_s = to_s - from_s;
         let mut mean = means.mean(from_s, to_s);
@@ -433,7 +433,7 @@ impl Scene<'_> {
         let mut course = Course::of(self, segment);
         let pairs = out.iter_mut().zip(times);
         match self.between.converter {
-            None => pairs.for_each(|(out, t)| *out = course.value(reference_s(*t), 0)),
+            None => pairs.for_each(|(out, t)| *out = course.value(reference_s(*t))),
             Some(Converter::Mean { window_s }) => pairs.for_each(|(out, t)| {
                 *out = course.mean(reference_s(t - window_s), reference_s(*t));
             }),

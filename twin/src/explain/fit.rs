@@ -263,12 +263,12 @@ pub fn polish(bench: &Workbench<'_>, from: &Fit) -> Fit {
             break;
         }
     }
-    elsewhere(bench, best)
+    other_minimum(bench, best)
 }
 
 /// The same, or a better one at other values of its times: a load with a rhythm of its own makes a minimum at each window of so many
 /// of its periods.
-pub fn elsewhere(bench: &Workbench<'_>, from: Fit) -> Fit {
+pub fn other_minimum(bench: &Workbench<'_>, from: Fit) -> Fit {
     let mut best = from;
     if !matches!(bench.problem.base, Base::Sensor(_)) {
         return best;

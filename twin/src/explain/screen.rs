@@ -105,9 +105,11 @@ impl Screening {
         least: f64,
         most: usize,
     ) -> Vec<[&'e Entry; 2]> {
-        let alone: Vec<f64> = (entries.iter())
-            .map(|entry| entry.folds.taken(&entry.rights))
-            .collect();
+        let folds = entries.iter().map(|entry| {
+            let (gram, sums) = (entry.folds.gram(), entry.folds.all(&entry.rights));
+            (gram, sums, entry.folds.taken(&entry.rights))
+        });
+        let own: Vec<(DMatrix<f64>, DVector<f64>, f64)> = folds.collect();
         let other = |a: usize, b: usize| {
             let [a, b] = [a, b].map(|k| entries[k].member.id());
             a != b
@@ -116,9 +118,11 @@ impl Screening {
             .into_par_iter()
             .flat_map_iter(|b| (0..b).filter(move |a| other(*a, b)).map(move |a| [a, b]))
             .filter_map(|[a, b]| {
-                let both = taken_together(entries[a], entries[b]);
-                let hidden = both >= least * self.energy && alone[a].max(alone[b]) < HIDDEN * both;
-                hidden.then_some((both, [a, b]))
+                let columns = [a, b].map(|k| &entries[k].columns[..]);
+                let [(gram_a, sums_a, alone_a), (gram_b, sums_b, alone_b)] = [&own[a], &own[b]];
+                let both = taken_together(columns, [gram_a, gram_b], [sums_a, sums_b]);
+                let hides = alone_a.max(*alone_b) < HIDDEN * both;
+                (hides && both >= least * self.energy).then_some((both, [a, b]))
             })
             .collect();
         pairs.sort_by(|one, other| other.0.total_cmp(&one.0));
@@ -136,18 +140,22 @@ impl Screening {
     }
 }
 
-/// What the columns of two entries take together, nothing held out.
-fn taken_together(one: &Entry, other: &Entry) -> f64 {
-    let columns: Vec<&Vec<f64>> = one.columns.iter().chain(&other.columns).collect();
-    let size = columns.len();
-    let gram = DMatrix::from_fn(size, size, |a, b| dot(columns[a], columns[b]));
-    let sums = one.folds.all(&one.rights);
-    let sums = sums
-        .iter()
-        .chain(other.folds.all(&other.rights).iter())
-        .copied()
-        .collect::<Vec<_>>();
-    let sums = DVector::from_vec(sums);
+/// What the columns of two entries take together, nothing held out; with the products of each one's columns with each other, and with
+/// the residual.
+fn taken_together(
+    [one, other]: [&[Vec<f64>]; 2],
+    [gram_one, gram_other]: [&DMatrix<f64>; 2],
+    [sums_one, sums_other]: [&DVector<f64>; 2],
+) -> f64 {
+    let (first, size) = (one.len(), one.len() + other.len());
+    let gram = DMatrix::from_fn(size, size, |a, b| match (a < first, b < first) {
+        (true, true) => gram_one[(a, b)],
+        (false, false) => gram_other[(a - first, b - first)],
+        // The half above is not read.
+        (true, false) => 0.0,
+        (false, true) => dot(&other[a - first], &one[b]),
+    });
+    let sums = DVector::from_iterator(size, sums_one.iter().chain(sums_other).copied());
     let mut factors = sums.clone();
     Solver::new(&gram, 1e-9).solve(&mut factors);
     factors.dot(&sums)
@@ -448,15 +456,17 @@ impl Folds {
         all
     }
 
+    /// Sum of all blocks' normal matrices.
+    fn gram(&self) -> DMatrix<f64> {
+        let size = self.grams.first().map_or(0, DMatrix::nrows);
+        let none = DMatrix::zeros(size, size);
+        self.grams.iter().fold(none, |sum, gram| sum + gram)
+    }
+
     /// Factors of the columns from all blocks; `rights` as in [`Folds::gain`].
     fn factors(&self, rights: &[f64]) -> DVector<f64> {
         let mut factors = self.all(rights);
-        let size = factors.len();
-        let gram = self
-            .grams
-            .iter()
-            .fold(DMatrix::zeros(size, size), |sum, gram| sum + gram);
-        Solver::new(&gram, 1e-9).solve(&mut factors);
+        Solver::new(&self.gram(), 1e-9).solve(&mut factors);
         factors
     }
 

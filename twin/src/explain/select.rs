@@ -15,7 +15,7 @@ pub use losses::{beaten, worse};
 pub use obstacle::{CERTAIN, at_end};
 pub use rivals::{does_as_well, joins};
 
-use super::fit::{Fit, elsewhere, fit, polish};
+use super::fit::{Fit, fit, other_minimum, polish};
 use super::screen::{DRAWS, Entry, screen};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::find;
@@ -194,7 +194,7 @@ impl Search<'_, '_> {
                     self.placebo_p99.push((id, p99));
                 }
             }
-            now = elsewhere(self.bench, better);
+            now = other_minimum(self.bench, better);
         }
         now
     }

@@ -69,7 +69,7 @@ pub(super) fn small(
         return Some("changes nothing".into());
     }
     let there = 1.0 - to / f64::max(from, 1e-300);
-    if jumps(&after.model, index) && chance(&before.residual, &after.residual) {
+    if ahead_of_an_edge(&after.model, index) && chance(&before.residual, &after.residual) {
         return Some("shown only by readings that noise takes over the other's threshold".into());
     }
     if member.effect.remembers() {
@@ -79,7 +79,7 @@ pub(super) fn small(
             return Some("what it remembers shows no more than by chance beside a curve".into());
         }
     }
-    let (gain, there) = if bench.is_white() || jumps(&after.model, index) {
+    let (gain, there) = if bench.is_white() || ahead_of_an_edge(&after.model, index) {
         size_beside(bench, &before.residual, &after.model, index)
     } else {
         (gain, there)
@@ -139,7 +139,7 @@ fn within_others(rms: f64, others: f64, unit: &str) -> String {
 }
 
 /// Whether noise that takes what one effect gives over an edge of another one makes readings jump: at a rail nothing jumps.
-fn jumps(model: &Model, index: usize) -> bool {
+fn ahead_of_an_edge(model: &Model, index: usize) -> bool {
     let mut others = model.members.iter().enumerate();
     let at_an_edge = |effect: &dyn Effect| effect.cuts() && effect.card().stage != Stage::Rail;
     others.any(|(other, member)| other != index && at_an_edge(member.effect))

@@ -7,7 +7,7 @@ use super::losses::{beaten, losses, share};
 use super::obstacle::{apart, at_end, beside, obstacle, only_aligns, small};
 use super::{Named, percent};
 use crate::effects::{Effect, find};
-use crate::explain::fit::{Fit, elsewhere, fit};
+use crate::explain::fit::{Fit, fit, other_minimum};
 use crate::explain::quieter::only_quietens;
 use crate::explain::robust::loss;
 use crate::explain::screen::screen;
@@ -191,7 +191,7 @@ pub(super) fn plainer(
                     })
                 })
                 // As was done with what it is compared with.
-                .map(|fit| elsewhere(bench, fit.clone()))
+                .map(|fit| other_minimum(bench, fit.clone()))
                 .filter(|fit| !beaten(bench, fit, now))
                 // In one spread for all: in its own, a bad fit's residual is a small one.
                 .min_by(|a, b| {
