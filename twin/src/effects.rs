@@ -26,6 +26,7 @@ mod hum;
 mod lag;
 mod means;
 mod moving_average;
+pub mod ocv;
 mod ocv_hysteresis;
 mod offset;
 mod offset_temperature;

@@ -7,6 +7,7 @@ mod battery;
 mod charge;
 pub mod checks;
 mod codes;
+mod counter;
 mod frame;
 mod held;
 mod phase;

@@ -87,6 +87,9 @@ pub struct Drive {
     pub cell_temperature_c: Option<Series>,
     /// Temperature of the surroundings in °C.
     pub ambient_c: Option<Series>,
+    /// Where the mean over the step that ends at each row lies, from the value where it begins (0) to the one where it ends (1), as a
+    /// counter beside the current tells ([`ends`]); `None`: half-way, the reference goes in straight lines.
+    pub mean_share: Option<Series>,
     /// Stretches with one clock and no gap; filters start anew in each.
     pub segments: Vec<Range<usize>>,
     /// True where the segment of the same index continues the one before: a gap, and no new operation. What a cell or a core
@@ -314,6 +317,17 @@ pub fn evenly(rows: impl Iterator<Item = usize> + Clone, most: usize) -> Vec<usi
     rows.step_by(stride).collect()
 }
 
+/// Values between which a quantity goes in a straight line over a step whose mean lies at a share of the way from one of its ends to the
+/// other: 0, it stays and jumps where the step ends; 0.5, a straight line; 1, it jumps where the step begins.
+#[inline]
+pub fn ends(mean_share: f64, [from, to]: [f64; 2]) -> [f64; 2] {
+    let at = |share: f64| from + share * (to - from);
+    [
+        at((2.0 * mean_share - 1.0).max(0.0)),
+        at((2.0 * mean_share).min(1.0)),
+    ]
+}
+
 impl Problem {
     /// Whether time means nothing in this recording.
     pub fn quasi_static(&self) -> bool {
@@ -449,6 +463,26 @@ impl Drive {
     /// Whether a segment continues the one before.
     pub fn is_continued(&self, segment: usize) -> bool {
         segment > 0 && self.continues.get(segment).copied().unwrap_or_default()
+    }
+
+    /// Values between which the current goes in a straight line over the step that ends at a row, from its values at the two rows.
+    #[inline]
+    pub fn ends(&self, row: usize, pair: [f64; 2]) -> [f64; 2] {
+        let share = self.mean_share.as_ref().and_then(|share| share.get(row));
+        share.map_or(pair, |share| ends(*share, pair))
+    }
+
+    /// Integral of the reference over time from the start of each segment: Coulomb, if it is a current in A.
+    pub fn charge(&self) -> Vec<f64> {
+        let mut charge = vec![0.0; self.len()];
+        for rows in &self.segments {
+            for row in rows.clone().skip(1) {
+                let [from, to] = self.ends(row, [self.reference[row - 1], self.reference[row]]);
+                let step_s = self.t_s[row] - self.t_s[row - 1];
+                charge[row] = charge[row - 1] + 0.5 * (from + to) * step_s;
+            }
+        }
+        charge
     }
 
     /// Rows that stand for one recorded step, 1 or more.

@@ -81,15 +81,19 @@ impl Effect for CellSelfHeating {
             let around = &mut battery.temperature_c[rows.start..rows.end];
             let mut before_c = around[0];
             let factors = &mut battery.factor[rows.start + 1..rows.end];
-            for (((times, pair), t), factor) in
-                times.zip(currents).zip(&mut around[1..]).zip(factors)
+            for ((((times, pair), t), factor), row) in times
+                .zip(currents)
+                .zip(&mut around[1..])
+                .zip(factors)
+                .zip(rows.start + 1..)
             {
                 let step = times[1] - times[0];
                 if step != step_s {
                     (step_s, kept) = (step, (-step / tau_s).exp());
                 }
                 // The mean square of a current that goes in a straight line, at the temperature where the step begins.
-                let square = (pair[0] * pair[0] + pair[0] * pair[1] + pair[1] * pair[1]) / 3.0;
+                let [from, to] = drive.ends(row, [pair[0], pair[1]]);
+                let square = (from * from + from * to + to * to) / 3.0;
                 let loss_w = ohms * factor_at(before_c, warmer_k) * square;
                 warmer_k = kept * warmer_k + (1.0 - kept) * rth_k_per_w * loss_w;
                 before_c = *t;

@@ -12,6 +12,9 @@ pub struct Nuisance {
     pub soc_shift: Vec<f64>,
     /// Relative change of the ohmic resistance.
     pub resistance: f64,
+    /// What the open-circuit voltage of a cell is above each line of its table, half-way between its points, in V; nothing where there is
+    /// no value.
+    pub ocv_bend_v: Vec<f64>,
     /// Time by which readings are late, within half a step of the sampling: how samples stand for what is between them.
     pub alignment_s: f64,
 }
@@ -75,6 +78,8 @@ pub enum Change {
     SocShift,
     /// [`Nuisance::resistance`].
     Resistance,
+    /// [`Nuisance::ocv_bend_v`].
+    OcvBend,
     /// [`Nuisance::alignment_s`].
     Alignment,
 }
@@ -84,7 +89,7 @@ fn first(links: &[Link<'_>], change: Change) -> usize {
     let tells = |link: &Link<'_>| match (change, link) {
         (Change::Member(index), Link::Effect(_, _, member)) => *member == Some(index),
         (Change::SocShift, Link::Count)
-        | (Change::Resistance, Link::Terminals)
+        | (Change::Resistance | Change::OcvBend, Link::Terminals)
         | (Change::Alignment, Link::Sample) => true,
         _ => false,
     };
@@ -328,6 +333,7 @@ impl<'a> Chain<'a> {
                     if self.problem.view == View::StateOfCharge {
                         scene.signal = battery.soc.iter().map(|soc| 100.0 * soc).collect();
                     } else {
+                        battery.bend(&nuisance.ocv_bend_v);
                         battery.voltage(&mut scene.signal);
                     }
                 }

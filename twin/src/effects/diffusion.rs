@@ -1,6 +1,7 @@
 //! Solid diffusion.
 
-use super::scene::{Scale, Scene, open_circuit_v};
+use super::ocv::open_circuit_v;
+use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, IDEALISED, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
 

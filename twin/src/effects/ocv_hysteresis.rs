@@ -76,7 +76,8 @@ impl Effect for OcvHysteresis {
         for rows in drive.operations() {
             let mut h = 0.0;
             for row in rows.skip(1) {
-                let i = 0.5 * (signal[row] + signal[row - 1]);
+                let [from, to] = drive.ends(row, [signal[row - 1], signal[row]]);
+                let i = 0.5 * (from + to);
                 if i != 0.0 {
                     let target = -i.signum();
                     h = target

@@ -5,8 +5,9 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use super::between::Between;
+use super::ocv::{self, open_circuit_v};
 use crate::problem::{
-    Base, BatteryBase, Drive, Moments, Observed, Problem, SensorBase, Series, View,
+    Base, BatteryBase, Drive, Moments, Observed, Problem, SensorBase, Series, View, ends,
 };
 
 /// Reference temperature of every temperature coefficient, in °C.
@@ -240,6 +241,8 @@ pub struct Steps {
     length_s: Vec<f64>,
     /// Length of every step of a segment, where they are all of one kind.
     pub(super) even_s: Vec<Option<f64>>,
+    /// [`Drive::mean_share`].
+    mean_share: Option<Series>,
 }
 
 impl Steps {
@@ -284,6 +287,7 @@ impl Steps {
             kind,
             length_s,
             even_s,
+            mean_share: drive.mean_share.clone(),
         }
     }
 
@@ -363,8 +367,8 @@ impl Steps {
         output
     }
 
-    /// A sum of first-order low-passes of one input, each with a weight, all at rest when a segment begins: one pass over the
-    /// rows.
+    /// A sum of first-order low-passes of a current, each with a weight, all at rest when a segment begins: one pass over the rows.
+    /// Between the rows it goes as [`Drive::mean_share`] says.
     pub fn ladder<const N: usize>(
         &self,
         segments: &[Range<usize>],
@@ -384,9 +388,14 @@ impl Steps {
         for rows in segments.iter().filter(|rows| !rows.is_empty()) {
             let mut last = [0.0; N];
             let after = rows.start + 1..rows.end;
+            let shares = self.mean_share.as_ref();
+            let shares = shares.map_or(&[][..], |shares| &shares[after.clone()]);
+            let mut shares = shares.iter();
             let pairs = input[rows.clone()].windows(2);
             for ((pair, out), kind) in pairs.zip(&mut output[after.clone()]).zip(&self.kind[after])
             {
+                let pair = [pair[0], pair[1]];
+                let pair = shares.next().map_or(pair, |share| ends(*share, pair));
                 let [kept, from, to] = &of_kind[*kind as usize];
                 let mut sum = 0.0;
                 for k in 0..N {
@@ -802,13 +811,11 @@ impl<'a> Battery<'a> {
             };
             soc[rows.start] = first;
             let mut last = first;
-            let after = rows.start + 1..rows.end;
-            let steps = drive.t_s[rows.clone()].windows(2);
-            let pairs = current_a[rows.clone()].windows(2);
-            for ((soc, pair), times) in soc[after].iter_mut().zip(pairs).zip(steps) {
-                let mean = mean_flow(pair[0], pair[1], self.efficiency);
-                last -= mean * (times[1] - times[0]) * per_as;
-                *soc = last;
+            for row in rows.start + 1..rows.end {
+                let [from, to] = drive.ends(row, [current_a[row - 1], current_a[row]]);
+                let mean = mean_flow(from, to, self.efficiency);
+                last -= mean * (drive.t_s[row] - drive.t_s[row - 1]) * per_as;
+                soc[row] = last;
             }
             end = last;
         }
@@ -818,6 +825,15 @@ impl<'a> Battery<'a> {
     /// Looks up the open-circuit voltage: after the charge is counted.
     pub fn open_circuit(&mut self) {
         self.open_circuit_v = open_circuit_v(&self.base.ocv, &self.soc).into();
+    }
+
+    /// Adds what the curve bends between the points of its table, in V of one cell half-way between them: after it was looked up.
+    pub fn bend(&mut self, bend_v: &[f64]) {
+        if bend_v.iter().any(|v| *v != 0.0) {
+            let of_string: Vec<f64> = bend_v.iter().map(|v| v * self.base.cells).collect();
+            let table = &self.base.ocv;
+            ocv::bend(table, &of_string, &self.soc, &mut self.open_circuit_v);
+        }
     }
 
     /// What temperature does to the resistance: after the stage of temperature.
@@ -874,38 +890,6 @@ pub fn gap_ah(ends_a: [f64; 2], gap_s: f64, excess_ah: f64, efficiency: f64) -> 
 pub fn arrhenius(b_k: f64, temperature_c: f64) -> f64 {
     let inverse = 1.0 / (temperature_c + ZERO_CELSIUS_K) - 1.0 / (REFERENCE_C + ZERO_CELSIUS_K);
     (b_k * inverse).exp()
-}
-
-/// Straight lines between the points of the table and beyond its ends.
-pub fn open_circuit_v(table: &[(f64, f64)], soc: &[f64]) -> Vec<f64> {
-    match table {
-        [] => vec![0.0; soc.len()],
-        [only] => vec![only.1; soc.len()],
-        _ => {
-            let last = table.len() - 2;
-            // The line in use, and where it ends.
-            let (mut at, mut low, mut high) = (0, f64::INFINITY, f64::NEG_INFINITY);
-            let (mut from, mut slope) = (table[0], 0.0);
-            soc.iter()
-                .map(|&soc| {
-                    if !(low <= soc && soc < high) {
-                        while at > 0 && table[at].0 > soc {
-                            at -= 1;
-                        }
-                        while at < last && table[at + 1].0 <= soc {
-                            at += 1;
-                        }
-                        let to = table[at + 1];
-                        from = table[at];
-                        slope = (to.1 - from.1) / (to.0 - from.0);
-                        low = if at == 0 { f64::NEG_INFINITY } else { from.0 };
-                        high = if at == last { f64::INFINITY } else { to.0 };
-                    }
-                    from.1 + slope * (soc - from.0)
-                })
-                .collect()
-        }
-    }
 }
 
 #[cfg(test)]

@@ -7,12 +7,15 @@ use super::robust::spread;
 use super::starts;
 use super::workbench::{Model, Workbench};
 use crate::effects::Search;
-use crate::effects::chain::Change;
+use crate::effects::chain::{Change, Nuisance};
 use crate::problem::Base;
 
 /// What the model file says of the base is off by this many of its own standard uncertainties at most: beyond them it is no
 /// uncertainty but physics that was left out, and has a name.
 pub const BASE_OFF: f64 = 4.0;
+
+/// A small step of a bend, as a share of its uncertainty.
+const SMALL_BEND: f64 = 1e-3;
 
 /// Whether a value of the base stands at that end, by how many of its standard uncertainties it is off.
 pub(super) fn at_base_end(deviations: f64) -> bool {
@@ -27,6 +30,8 @@ pub(super) enum Coordinate {
     /// Index of the start, among those of the bench.
     SocShift(usize),
     Resistance,
+    /// Index of the line, among those of the bench that bend.
+    OcvBend(usize),
     Alignment,
 }
 
@@ -37,6 +42,7 @@ impl Coordinate {
             Self::Value(member, _, _) => Change::Member(member),
             Self::SocShift(_) => Change::SocShift,
             Self::Resistance => Change::Resistance,
+            Self::OcvBend(_) => Change::OcvBend,
             Self::Alignment => Change::Alignment,
         }
     }
@@ -128,6 +134,7 @@ impl Slope {
             *at = match coordinate {
                 Coordinate::SocShift(start) => bench.starts[*start].at(&model.nuisance),
                 Coordinate::Resistance => model.nuisance.resistance,
+                Coordinate::OcvBend(bend) => bend_at(bench, *bend, &model.nuisance),
                 _ => *at,
             };
         }
@@ -204,11 +211,26 @@ fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta
             let resistance = model.nuisance.resistance + delta;
             model.nuisance.resistance = resistance.clamp((-most).max(-0.9), most);
         }
+        Coordinate::OcvBend(bend) => {
+            let (line, sigma_v) = bench.bends[bend];
+            let heights_v = &mut model.nuisance.ocv_bend_v;
+            if heights_v.len() <= line {
+                heights_v.resize(line + 1, 0.0);
+            }
+            let most_v = BASE_OFF * sigma_v;
+            heights_v[line] = (heights_v[line] + delta).clamp(-most_v, most_v);
+        }
         Coordinate::Alignment => {
             let most = 0.6 * bench.scale.step_s.max(bench.scale.reading_step_s);
             model.nuisance.alignment_s = (model.nuisance.alignment_s + delta).clamp(-most, most);
         }
     }
+}
+
+/// What a line of the table is bent by in a model, in V.
+fn bend_at(bench: &Workbench<'_>, bend: usize, nuisance: &Nuisance) -> f64 {
+    let (line, _) = bench.bends[bend];
+    nuisance.ocv_bend_v.get(line).copied().unwrap_or_default()
 }
 
 /// Free coordinates of a model with the size of a small step, the penalty and where it is.
@@ -264,6 +286,14 @@ pub(super) fn coordinates(
                 1e-4,
                 inverse(base.resistance_sigma),
                 model.nuisance.resistance,
+            ));
+        }
+        for (index, (_, sigma_v)) in bench.bends.iter().enumerate() {
+            all.push((
+                Coordinate::OcvBend(index),
+                SMALL_BEND * sigma_v,
+                inverse(*sigma_v),
+                bend_at(bench, index, &model.nuisance),
             ));
         }
     }

@@ -6,6 +6,7 @@ use super::select::{Selection, percent};
 use super::slope::{BASE_OFF, at_base_end};
 use super::workbench::{Member, Workbench};
 use super::{Nuisance, intervals, locate};
+use crate::effects::ocv::bend_v;
 use crate::effects::{CurrentError, find};
 use crate::problem::{Base, Problem};
 use crate::report::data::{
@@ -16,6 +17,8 @@ use crate::spectrum;
 
 /// What a battery is found to be off by is told from here on, in %.
 const TOLD_PERCENT: f64 = 0.1;
+/// Least bend of the open-circuit voltage that is told, in V.
+const TOLD_V: f64 = 0.001;
 /// An alignment of readings is told from this share of a step on.
 const TOLD_STEP: f64 = 0.05;
 /// What the model file leaves open is in the verdict's sentence if it makes the error smaller by this factor.
@@ -217,7 +220,7 @@ pub(super) fn sentence(
     });
     match verdict {
         Verdict::NoMismatch
-            if let Some(found) = base_differs(&selection.fit.model.nuisance)
+            if let Some(found) = base_differs(&selection.fit.model.nuisance, &bench.problem.base)
                 && report.signals.last().is_some_and(|signal| {
                     signal.rmse_before > NOT_AS_STATED * signal.rmse_after
                 }) =>
@@ -281,7 +284,7 @@ pub(super) fn sentence(
 /// What was found of a battery within what the model file leaves open: it is no physics that was left out, and part of every error
 /// after it.
 pub(super) fn base_found(name: &str, nuisance: &Nuisance, base: &Base) -> Option<String> {
-    base_differs(nuisance).map(|found| {
+    base_differs(nuisance, base).map(|found| {
         if at_limit(nuisance, base) {
             format!(
                 "{name}: {found} than stated is as far as the model file allows ({BASE_OFF} standard uncertainties), and more would fit \
@@ -300,8 +303,10 @@ fn at_limit(nuisance: &Nuisance, base: &Base) -> bool {
     };
     let ends = |found: f64, sigma: f64| sigma > 0.0 && at_base_end(found / sigma);
     let mut starts = nuisance.soc_shift.iter().zip(&base.initial_soc_sigma);
+    let mut bends = nuisance.ocv_bend_v.iter().enumerate();
     starts.any(|(shift, sigma)| ends(*shift, *sigma))
         || ends(nuisance.resistance, base.resistance_sigma)
+        || bends.any(|(line, found_v)| ends(base.cells * found_v, bend_v(&base.ocv, line)))
 }
 
 /// When an operation started, of several.
@@ -310,7 +315,10 @@ pub(super) fn start_of(operation: usize) -> String {
 }
 
 /// By what the battery as designed differs, if by more than [`TOLD_PERCENT`].
-fn base_differs(nuisance: &Nuisance) -> Option<String> {
+fn base_differs(nuisance: &Nuisance, base: &Base) -> Option<String> {
+    let Base::Battery(base) = base else {
+        return None;
+    };
     let by = |share: f64, what: &str, unit: &str| {
         let percent = 100.0 * share;
         let way = if percent > 0.0 { "higher" } else { "lower" };
@@ -325,9 +333,24 @@ fn base_differs(nuisance: &Nuisance) -> Option<String> {
             start_of(operation)
         ),
     };
+    let bends = nuisance.ocv_bend_v.iter().copied().enumerate();
+    let bend = bends
+        .filter(|(_, bend_v)| bend_v.abs() >= TOLD_V)
+        .max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))
+        .map(|(line, bend_v)| {
+            let ends_pct = [line, line + 1].map(|point| 100.0 * base.ocv.get(point).map_or(f64::NAN, |point| point.0));
+            format!(
+                "the open-circuit voltage from {} to {} % up to {} V {}",
+                short(ends_pct[0]),
+                short(ends_pct[1]),
+                short(bend_v.abs()),
+                if bend_v > 0.0 { "higher" } else { "lower" }
+            )
+        });
     let found: Vec<String> = [
         by(nuisance.resistance, "the ohmic resistance", "%"),
         by(shift, &start, "points of per cent"),
+        bend,
     ]
     .into_iter()
     .flatten()

@@ -16,6 +16,7 @@ use super::starts::Start;
 use super::steady::Steady;
 use super::whiten::Whitening;
 use crate::effects::chain::{Begun, Chain, Change, Nuisance, Variation};
+use crate::effects::ocv::bend_v;
 use crate::effects::scene::{ROUNDS, Scale};
 use crate::effects::{Clues, Effect, LIBRARY, Mark, Parameter, Stage, find_with};
 use crate::problem::{Base, Coloured, Drive, Moments, Problem, Series, View, evenly};
@@ -138,6 +139,9 @@ pub struct Workbench<'a> {
     pub blocks: Vec<Range<usize>>,
     /// At which states of charge operations begin, where that is not known exactly.
     pub starts: Vec<Start>,
+    /// Lines of the open-circuit voltage's table that may be bent by more than what readings are off by, with by how much, in V of one
+    /// cell.
+    pub(super) bends: Vec<(usize, f64)>,
     /// Effects that may be named.
     pub library: Vec<&'static dyn Effect>,
     /// Energy by which the equations of the effects that the model file has may be off.
@@ -152,6 +156,20 @@ pub struct Workbench<'a> {
     pub(super) contradiction: Option<Contradiction>,
     /// Makes the stated noise white, with the readings after it.
     white: Option<(Whitening, Vec<f64>)>,
+}
+
+/// See [`Workbench::bends`].
+fn bends(problem: &Problem) -> Vec<(usize, f64)> {
+    let Base::Battery(base) = &problem.base else {
+        return Vec::new();
+    };
+    let lines = 0..base.ocv.len().saturating_sub(1);
+    let seen_v = problem.noise + problem.accuracy.zero;
+    lines
+        .map(|line| (line, bend_v(&base.ocv, line)))
+        .filter(|(_, bend_v)| problem.view == View::Voltage && *bend_v > seen_v)
+        .map(|(line, bend_v)| (line, bend_v / base.cells))
+        .collect()
 }
 
 /// A model to the last digit.
@@ -174,6 +192,9 @@ fn key(model: &Model) -> Key {
         bits(
             &[
                 nuisance.soc_shift.as_slice(),
+                // What no start is taken for.
+                &[f64::NAN],
+                nuisance.ocv_bend_v.as_slice(),
                 &[nuisance.resistance, nuisance.alignment_s],
             ]
             .concat(),
@@ -277,6 +298,7 @@ impl<'a> Workbench<'a> {
             chain,
             scale,
             starts: Start::all(problem, &rows),
+            bends: bends(problem),
             marks,
             modelled,
             rows,
@@ -308,6 +330,7 @@ impl<'a> Workbench<'a> {
             chain: self.chain_of(problem),
             scale: self.scale,
             starts: self.starts.clone(),
+            bends: self.bends.clone(),
             rows: self.rows.clone(),
             t_s: self.t_s.clone(),
             y: self.y.clone(),

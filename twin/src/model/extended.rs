@@ -5,10 +5,13 @@ use std::{
     path::{Component, Path, PathBuf},
 };
 
-use toml_edit::{DocumentMut, Item, Table, TableLike, value};
+use toml_edit::{Array, DocumentMut, Item, Table, TableLike, Value, value};
 
 use super::Battery;
-use crate::{effects::chain::Nuisance, failure::Failure};
+use crate::{
+    effects::{chain::Nuisance, ocv::bent},
+    failure::Failure,
+};
 
 /// An effect to be written into a model file.
 #[derive(Clone, Debug, PartialEq)]
@@ -22,12 +25,14 @@ pub struct Found {
 }
 
 /// What the base differs by, within what the model file says it does not know.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Shift {
     /// Added to the initial state of charge, 0 … 1.
     pub soc: f64,
     /// Relative change of the ohmic resistance.
     pub resistance: f64,
+    /// What the open-circuit voltage of a cell is above each line of its table, half-way between its points, in V.
+    pub ocv_bend_v: Vec<f64>,
     /// Time by which readings stand for an earlier moment than their row, in s.
     pub alignment_s: f64,
     /// The reference goes from row to row in a smooth course.
@@ -47,6 +52,9 @@ impl Shift {
             if *mine == 0.0 {
                 *mine = found;
             }
+        }
+        if self.ocv_bend_v.is_empty() {
+            self.ocv_bend_v.clone_from(&nuisance.ocv_bend_v);
         }
     }
 }
@@ -150,6 +158,24 @@ impl Extension<'_> {
             set(table, "ohmic_resistance_ohm", value(resistance));
             was(table, "ohmic_resistance_ohm", battery.resistance_ohm);
         }
+        if !self.shift.ocv_bend_v.is_empty() {
+            let mut points: Array = bent(&battery.ocv, &self.shift.ocv_bend_v)
+                .into_iter()
+                .map(|(soc, volts)| Value::from_iter([soc, volts]))
+                .collect();
+            for point in points.iter_mut() {
+                point.decor_mut().set_prefix("\n    ");
+            }
+            points.set_trailing("\n");
+            points.set_trailing_comma(true);
+            table.remove("ocv_file");
+            set(table, "ocv", value(points));
+            said(
+                table,
+                "ocv",
+                "With what twin explain found between the points that were stated.",
+            );
+        }
     }
 }
 
@@ -167,13 +193,20 @@ fn set(table: &mut dyn TableLike, key: &str, mut new: Item) {
 
 /// Says ahead of a value what was stated.
 fn was(table: &mut dyn TableLike, key: &str, stated: f64) {
+    said(
+        table,
+        key,
+        &format!("Found by twin explain within its uncertainty; stated as {stated}."),
+    );
+}
+
+/// Says something ahead of a value.
+fn said(table: &mut dyn TableLike, key: &str, what: &str) {
     if let Some(mut key) = table.key_mut(key) {
         let decor = key.leaf_decor_mut();
         let before = decor.prefix().and_then(|prefix| prefix.as_str());
         let before = before.unwrap_or_default();
-        decor.set_prefix(format!(
-            "{before}# Found by twin explain within its uncertainty; stated as {stated}.\n"
-        ));
+        decor.set_prefix(format!("{before}# {what}\n"));
     }
 }
 

@@ -4,7 +4,10 @@ use std::ops::Range;
 
 use super::{Purpose, Work};
 use crate::{
-    effects::scene::{gap_ah, mean_flow},
+    effects::{
+        ocv::bend_v,
+        scene::{gap_ah, mean_flow},
+    },
     explain::slope::BASE_OFF,
     model::Battery,
     problem::{BatteryBase, Drive, Observed, View},
@@ -45,7 +48,7 @@ pub(super) fn find(
     battery: &Battery,
 ) {
     let drive = readings.drive;
-    let counter = work.drive_frame().column("ah_meas_ah");
+    let counter = work.drive_frame().column(super::battery::COUNTER);
     let counter: Option<Vec<f64>> =
         counter.map(|ah| readings.rows.iter().map(|row| ah[*row]).collect());
     let mut end = 1.0;
@@ -134,11 +137,12 @@ fn begun(
     }
 }
 
-/// Ah over a segment: straight lines, charging times the efficiency.
+/// Ah over a segment, charging times the efficiency.
 fn charge_ah(drive: &Drive, rows: Range<usize>, efficiency: f64) -> f64 {
     let mut charge = 0.0;
     for row in rows.start + 1..rows.end {
-        let mean_a = mean_flow(drive.reference[row - 1], drive.reference[row], efficiency);
+        let [from, to] = drive.ends(row, [drive.reference[row - 1], drive.reference[row]]);
+        let mean_a = mean_flow(from, to, efficiency);
         charge += mean_a * (drive.t_s[row] - drive.t_s[row - 1]);
     }
     charge / 3600.0
@@ -172,26 +176,46 @@ fn seen(base: &BatteryBase, readings: &Readings<'_>, segment: usize) -> Option<S
         return Some((value / 100.0, OF_READING.hypot(noise / 100.0)));
     }
     let current_a = drive.reference[drive.segments[segment].start];
-    let (soc, slope) = inverse(&base.ocv, value + base.resistance_ohm * current_a)?;
+    let there = inverse(&base.ocv, value + base.resistance_ohm * current_a)?;
     // A voltage under load says little.
     let loaded_v = 0.5 * base.resistance_ohm * current_a.abs();
     let within_v = (base.cells * AT_REST_V + loaded_v).hypot(noise);
-    Some((soc, (within_v / slope).min(WORTH)))
+    let within_v = within_v.hypot(there.bend_v);
+    Some((there.soc, (within_v / there.slope_v).min(WORTH)))
 }
 
-/// State of charge at an open-circuit voltage, and the slope there in V.
-fn inverse(ocv: &[(f64, f64)], volts: f64) -> Option<(f64, f64)> {
+/// Where an open-circuit voltage is on the table.
+struct Place {
+    /// State of charge, 0 … 1.
+    soc: f64,
+    /// Slope of the line that it is on, in V.
+    slope_v: f64,
+    /// What the curve may be off that line by half-way between its points, in V.
+    bend_v: f64,
+}
+
+/// The state of charge at an open-circuit voltage.
+fn inverse(ocv: &[(f64, f64)], volts: f64) -> Option<Place> {
     let (first, last) = (ocv.first()?, ocv.last()?);
-    let pair = ocv
-        .windows(2)
-        .find(|pair| pair[0].1 <= volts && volts <= pair[1].1 && pair[1].1 > pair[0].1);
-    let end = |pair: &[(f64, f64)]| ((pair[1].1 - pair[0].1) / (pair[1].0 - pair[0].0)).max(1e-3);
-    match pair {
-        Some(pair) => {
-            let share = (volts - pair[0].1) / (pair[1].1 - pair[0].1);
-            Some((pair[0].0 + share * (pair[1].0 - pair[0].0), end(pair)))
+    let lines = ocv.len().checked_sub(1).filter(|lines| *lines > 0)?;
+    let slope_v = |line: usize| (ocv[line + 1].1 - ocv[line].1) / (ocv[line + 1].0 - ocv[line].0);
+    let is_there = |line: &usize| {
+        let (from, to) = (ocv[*line].1, ocv[line + 1].1);
+        from <= volts && volts <= to && to > from
+    };
+    let line = (0..lines).find(is_there);
+    let (line, soc) = match line {
+        Some(line) => {
+            let (from, to) = (ocv[line], ocv[line + 1]);
+            let share = (volts - from.1) / (to.1 - from.1);
+            (line, from.0 + share * (to.0 - from.0))
         }
-        None if volts < first.1 => Some((first.0, end(&ocv[..2]))),
-        None => Some((last.0, end(&ocv[ocv.len() - 2..]))),
-    }
+        None if volts < first.1 => (0, first.0),
+        None => (lines - 1, last.0),
+    };
+    Some(Place {
+        soc,
+        slope_v: slope_v(line).max(1e-3),
+        bend_v: bend_v(ocv, line),
+    })
 }

@@ -204,6 +204,7 @@ fn finer(drive: &Drive, slopes: Slopes) -> Drive {
     let held = |series: &Series| places.iter().map(|(row, _)| series[*row]).collect();
     let also = |series: &Option<Series>| series.as_ref().map(|series| straight(series));
     Drive {
+        mean_share: None,
         t_s,
         reference,
         sensor_temperature_c: also(&drive.sensor_temperature_c),
