@@ -617,6 +617,7 @@ mod tests {
             |of: &dyn Fn(f64) -> f64| -> Series { (0..300).map(|k| of(f64::from(k))).collect() };
         let t_s = series(&|k| 0.5 * k);
         let drive = Drive {
+            mean_share: None,
             t_s: t_s.clone(),
             reference: series(&|k| {
                 30.0 * (0.05 * k).sin() + if k % 70.0 < 30.0 { 20.0 } else { 0.0 }

@@ -363,7 +363,7 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
                     .collect(),
             });
         }
-        shift.take(&fitted.nuisance);
+        shift.take(&fitted.nuisance, fitted.of_battery);
         shift.smooth_reference |= fitted.smooth_reference;
     }
     model.extended(&found, shift, file.parent().unwrap_or(Path::new("")), out)

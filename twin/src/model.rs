@@ -128,6 +128,8 @@ pub struct Battery {
     pub resistance_ohm: f64,
     /// Its relative standard uncertainty.
     pub resistance_uncertainty: f64,
+    /// Time by which voltages were read before the current of their row, in s; `twin explain` finds it.
+    pub alignment_s: f64,
     /// Open-circuit voltage of one cell: state of charge (ascending) and V; empty if not stated.
     pub ocv: Vec<(f64, f64)>,
     /// The file that it is from, if it is from one.
@@ -165,6 +167,8 @@ struct BatteryText {
     ohmic_resistance_ohm: f64,
     #[serde(default)]
     resistance_uncertainty: f64,
+    #[serde(default)]
+    alignment_s: f64,
     #[serde(default)]
     ocv: Vec<(f64, f64)>,
     ocv_file: Option<PathBuf>,
@@ -521,6 +525,12 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         efficiency > 0.5 && efficiency <= 1.0,
         "a share above 0.5, at most 1",
     )?;
+    range(
+        "alignment_s",
+        text.alignment_s,
+        text.alignment_s.is_finite(),
+        "a time in s, below 0 if voltages were read after the current",
+    )?;
     if let Some(soc) = text.initial_soc {
         range(
             "initial_soc",
@@ -557,6 +567,7 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         efficiency,
         resistance_ohm: text.ohmic_resistance_ohm,
         resistance_uncertainty: text.resistance_uncertainty,
+        alignment_s: text.alignment_s,
         ocv,
         ocv_file,
         initial_soc: text.initial_soc,

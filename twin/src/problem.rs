@@ -254,6 +254,8 @@ pub struct BatteryBase {
     pub resistance_ohm: f64,
     /// Relative standard uncertainty of [`BatteryBase::resistance_ohm`]; 0: exact.
     pub resistance_sigma: f64,
+    /// Time by which voltages were read before the current of their row, in s.
+    pub alignment_s: f64,
 }
 
 /// A comparison of one signal: the input of every later stage.
@@ -542,5 +544,34 @@ impl Observed {
     /// Rows that count.
     pub fn valid_rows(&self) -> usize {
         self.valid.iter().filter(|valid| **valid).count()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn the_mean_of_a_step_lies_where_its_share_says(
+            share in 0.0..=1.0f64,
+            pair in [-500.0..500.0f64, -500.0..500.0f64],
+        ) {
+            let [from, to] = ends(share, pair);
+            let mean = pair[0] + share * (pair[1] - pair[0]);
+            prop_assert!((0.5 * (from + to) - mean).abs() < 1e-9);
+            // It never leaves what lies between the two rows.
+            let [low, high] = [pair[0].min(pair[1]), pair[0].max(pair[1])];
+            prop_assert!([from, to].iter().all(|end| (low - 1e-9..=high + 1e-9).contains(end)));
+        }
+    }
+
+    #[test]
+    fn a_step_stays_is_straight_or_comes_before() {
+        let pair = [2.0, 10.0];
+        assert_eq!(ends(0.0, pair), [2.0, 2.0]);
+        assert_eq!(ends(0.5, pair), pair);
+        assert_eq!(ends(1.0, pair), [10.0, 10.0]);
     }
 }

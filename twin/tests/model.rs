@@ -303,15 +303,44 @@ fn an_effect_that_is_there_gets_the_new_values() {
 #[test]
 fn what_the_sensor_is_off_by_does_not_hide_what_the_battery_is() {
     let mut shift = Shift::default();
-    for (alignment_s, soc_shift) in [(0.02, 0.0), (0.0, -0.03), (0.05, 0.01)] {
+    let found = [
+        (0.02, 0.0, false),
+        (0.3, -0.03, true),
+        (0.05, 0.0, false),
+        (0.4, 0.01, true),
+    ];
+    for (alignment_s, soc_shift, of_battery) in found {
         let found = Nuisance {
             alignment_s,
             soc_shift: vec![soc_shift],
             ..Nuisance::default()
         };
-        shift.take(&found);
+        shift.take(&found, of_battery);
     }
     assert_eq!((shift.alignment_s, shift.soc), (0.02, -0.03));
+    assert_eq!(shift.voltage_alignment_s, 0.3);
+}
+
+#[test]
+fn what_was_found_of_a_battery_and_its_tester_is_written_into_its_table() {
+    let text = "schema = 1\n[battery]\ncapacity_ah = 2\nalignment_s = 0.1\n# From the data sheet.\nocv = [[0, 3.0], [0.5, 3.6], [1, 4.0]]\n";
+    let model = parse(text).unwrap();
+    let shift = Shift {
+        ocv_bend_v: vec![0.03],
+        voltage_alignment_s: -0.3,
+        ..Shift::default()
+    };
+    let here = Path::new(".");
+    let written = model.extended(&[], shift, here, here).unwrap();
+    assert!(written.contains("# From the data sheet."), "{written}");
+    let battery = parse(&written).unwrap().battery.unwrap();
+    assert!((battery.alignment_s + 0.2).abs() < 1e-12);
+    // The points that were stated, and between the first two the bend.
+    for point in [(0.0, 3.0), (0.25, 3.33), (0.5, 3.6), (1.0, 4.0)] {
+        let is_there = |at: &&(f64, f64)| (at.0 - point.0).abs() < 1e-9;
+        let at = battery.ocv.iter().find(is_there).expect("a point");
+        assert!((at.1 - point.1).abs() < 1e-9, "{at:?}");
+    }
 }
 
 #[test]

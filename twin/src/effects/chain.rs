@@ -302,8 +302,11 @@ impl<'a> Chain<'a> {
                 scene.onto_rows();
             }
             Link::Sample => {
-                scene.delay_s +=
-                    nuisance.alignment_s + scene.sensor.map_or(0.0, |sensor| sensor.alignment_s);
+                let by_design_s = match &self.problem.base {
+                    Base::Sensor(base) => base.alignment_s,
+                    Base::Battery(base) => base.alignment_s,
+                };
+                scene.delay_s += nuisance.alignment_s + by_design_s;
                 scene.sample(self.problem.view);
             }
             // Without a reading as designed the series stays shared.

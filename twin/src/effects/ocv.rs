@@ -103,7 +103,9 @@ mod tests {
     fn the_bends_of_a_table_are_those_of_a_parabola_through_it() {
         let table = table();
         let heights_v: Vec<f64> = (0..2).map(|line| bend_v(&table, line)).collect();
-        let soc: Vec<f64> = (10..=50).map(|percent| f64::from(percent) / 100.0).collect();
+        let soc: Vec<f64> = (10..=50)
+            .map(|percent| f64::from(percent) / 100.0)
+            .collect();
         let mut volts = open_circuit_v(&table, &soc);
         bend(&table, &heights_v, &soc, &mut volts);
         for (soc, volts) in soc.iter().zip(volts) {

@@ -94,7 +94,10 @@ pub fn variables(bench: &Workbench<'_>) -> Vec<Variable> {
         });
     }
     if bench.scale.capacity_ah > 0.0 {
-        let values = at_rows(bench, &drive.charge()).iter().map(|q| q / 3600.0).collect();
+        let values = at_rows(bench, &drive.charge())
+            .iter()
+            .map(|q| q / 3600.0)
+            .collect();
         variables.push(Variable {
             name: "charge drawn",
             unit: "Ah".to_owned(),

@@ -221,7 +221,12 @@ fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta
             heights_v[line] = (heights_v[line] + delta).clamp(-most_v, most_v);
         }
         Coordinate::Alignment => {
-            let most = 0.6 * bench.scale.step_s.max(bench.scale.reading_step_s);
+            // A sensor's sample stands for the middle of two at most; a tester's scan of its channels ends with the row.
+            let share = match bench.problem.base {
+                Base::Sensor(_) => 0.6,
+                Base::Battery(_) => 1.0,
+            };
+            let most = share * bench.scale.step_s.max(bench.scale.reading_step_s);
             model.nuisance.alignment_s = (model.nuisance.alignment_s + delta).clamp(-most, most);
         }
     }

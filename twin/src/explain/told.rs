@@ -220,7 +220,8 @@ pub(super) fn sentence(
     });
     match verdict {
         Verdict::NoMismatch
-            if let Some(found) = base_differs(&selection.fit.model.nuisance, &bench.problem.base)
+            if let Some(found) =
+                base_differs(&selection.fit.model.nuisance, &bench.problem.base)
                 && report.signals.last().is_some_and(|signal| {
                     signal.rmse_before > NOT_AS_STATED * signal.rmse_after
                 }) =>
@@ -338,7 +339,8 @@ fn base_differs(nuisance: &Nuisance, base: &Base) -> Option<String> {
         .filter(|(_, bend_v)| bend_v.abs() >= TOLD_V)
         .max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))
         .map(|(line, bend_v)| {
-            let ends_pct = [line, line + 1].map(|point| 100.0 * base.ocv.get(point).map_or(f64::NAN, |point| point.0));
+            let ends_pct = [line, line + 1]
+                .map(|point| 100.0 * base.ocv.get(point).map_or(f64::NAN, |point| point.0));
             format!(
                 "the open-circuit voltage from {} to {} % up to {} V {}",
                 short(ends_pct[0]),
@@ -394,13 +396,18 @@ pub(super) fn times_found(
 ) -> Vec<String> {
     let (name, unit) = (&bench.problem.name, &bench.problem.unit);
     let later_s = fit.model.nuisance.alignment_s;
-    let aligned = (later_s.abs() > TOLD_STEP * bench.scale.reading_step_s).then(|| {
-        format!(
-            "{name}: readings stand for a moment {} s {} than their rows, less than a row apart and so no effect by itself; \
+    let size_s = short(later_s.abs());
+    let aligned = (later_s.abs() > TOLD_STEP * bench.scale.reading_step_s).then(|| match bench.problem.base {
+        Base::Sensor(_) => format!(
+            "{name}: readings stand for a moment {size_s} s {} than their rows, less than a row apart and so no effect by itself; \
              a delay of that size beside what is named would look the same",
-            short(later_s.abs()),
-            if later_s > 0.0 { "earlier" } else { "later" }
-        )
+            if later_s > 0.0 { "earlier" } else { "later" },
+        ),
+        Base::Battery(_) => format!(
+            "{name}: voltages were read {size_s} s {} the currents of their rows, which is the tester's and no effect; the errors after \
+             are with that",
+            if later_s > 0.0 { "before" } else { "after" },
+        ),
     });
     let smooth = course.map(|[straight, smooth]| {
         format!(
@@ -462,6 +469,7 @@ pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
             .map(|member| (member.id().to_owned(), values(member)))
             .collect(),
         nuisance: fit.model.nuisance.clone(),
+        of_battery: matches!(problem.base, Base::Battery(_)),
         smooth_reference: matches!(&problem.base, Base::Sensor(base) if base.smooth_reference),
     }
 }

@@ -9,6 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use rand_distr::{Distribution as _, StandardNormal};
 
+use super::apart::reads_apart;
 use super::censored::{Censored, Contradiction};
 use super::robust::spread;
 use super::slope::change;
@@ -142,6 +143,8 @@ pub struct Workbench<'a> {
     /// Lines of the open-circuit voltage's table that may be bent by more than what readings are off by, with by how much, in V of one
     /// cell.
     pub(super) bends: Vec<(usize, f64)>,
+    /// Whether voltages were read at another moment than the currents of their rows.
+    pub(super) apart: bool,
     /// Effects that may be named.
     pub library: Vec<&'static dyn Effect>,
     /// Energy by which the equations of the effects that the model file has may be off.
@@ -299,6 +302,7 @@ impl<'a> Workbench<'a> {
             scale,
             starts: Start::all(problem, &rows),
             bends: bends(problem),
+            apart: reads_apart(problem),
             marks,
             modelled,
             rows,
@@ -331,6 +335,7 @@ impl<'a> Workbench<'a> {
             scale: self.scale,
             starts: self.starts.clone(),
             bends: self.bends.clone(),
+            apart: self.apart,
             rows: self.rows.clone(),
             t_s: self.t_s.clone(),
             y: self.y.clone(),
@@ -713,10 +718,13 @@ impl<'a> Workbench<'a> {
         }
     }
 
-    /// Whether the sub-step alignment is free in a model: an effect works on what is between the samples.
+    /// Whether the sub-step alignment is free in a model: an effect works on what is between the samples, or a tester reads voltage and
+    /// current one after the other.
     pub fn aligns(&self, model: &Model) -> bool {
-        matches!(self.problem.base, Base::Sensor(_))
-            && !model.unaligned
+        if let Base::Battery(_) = self.problem.base {
+            return self.apart && !model.unaligned;
+        }
+        !model.unaligned
             // These have a time of their own.
             && !model.has("delay")
             && !model.has("sampled-window")

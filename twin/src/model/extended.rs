@@ -33,21 +33,28 @@ pub struct Shift {
     pub resistance: f64,
     /// What the open-circuit voltage of a cell is above each line of its table, half-way between its points, in V.
     pub ocv_bend_v: Vec<f64>,
-    /// Time by which readings stand for an earlier moment than their row, in s.
+    /// Time by which a sensor's readings stand for an earlier moment than their row, in s.
     pub alignment_s: f64,
+    /// The same of a battery's voltages.
+    pub voltage_alignment_s: f64,
     /// The reference goes from row to row in a smooth course.
     pub smooth_reference: bool,
 }
 
 impl Shift {
     /// What was found for one signal; of each value the first that says something counts.
-    pub fn take(&mut self, nuisance: &Nuisance) {
+    pub fn take(&mut self, nuisance: &Nuisance, of_battery: bool) {
+        let alignment_s = if of_battery {
+            &mut self.voltage_alignment_s
+        } else {
+            &mut self.alignment_s
+        };
         // What is stated is the start of the first operation.
         let soc_shift = nuisance.soc_shift.first().copied().unwrap_or_default();
         for (mine, found) in [
             (&mut self.soc, soc_shift),
             (&mut self.resistance, nuisance.resistance),
-            (&mut self.alignment_s, nuisance.alignment_s),
+            (alignment_s, nuisance.alignment_s),
         ] {
             if *mine == 0.0 {
                 *mine = found;
@@ -82,7 +89,7 @@ impl Extension<'_> {
         if self.shift.alignment_s != 0.0
             && let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut)
         {
-            set(sensor, "alignment_s", value(self.shift.alignment_s));
+            add(sensor, "alignment_s", self.shift.alignment_s);
         }
         if self.shift.smooth_reference
             && let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut)
@@ -146,6 +153,9 @@ impl Extension<'_> {
         let Some(battery) = self.battery else {
             return;
         };
+        if self.shift.voltage_alignment_s != 0.0 {
+            add(table, "alignment_s", self.shift.voltage_alignment_s);
+        }
         // Where none is stated, each recording's first reading tells its own: one of this recording would be wrong for any other.
         if let Some(soc) = battery.initial_soc.filter(|_| self.shift.soc != 0.0) {
             // Beyond 0 … 1 no model file may state it.
@@ -189,6 +199,13 @@ fn set(table: &mut dyn TableLike, key: &str, mut new: Item) {
         *new.decor_mut() = old.decor().clone();
     }
     *place = new;
+}
+
+/// Adds to a number, 0 if there is none.
+fn add(table: &mut dyn TableLike, key: &str, more: f64) {
+    let number = |item: &Item| item.as_float().or(item.as_integer().map(|n| n as f64));
+    let stated = table.get(key).and_then(number).unwrap_or_default();
+    set(table, key, value(stated + more));
 }
 
 /// Says ahead of a value what was stated.

@@ -108,6 +108,10 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             cells,
             resistance_ohm: battery.resistance_ohm * cells,
             resistance_sigma: battery.resistance_uncertainty,
+            alignment_s: match view {
+                View::Voltage => battery.alignment_s,
+                _ => 0.0,
+            },
         };
         if work.purpose.compares() {
             let source = work.frame.source();

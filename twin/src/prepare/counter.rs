@@ -5,7 +5,6 @@
 //! was integrated inside, and says where the mean of each interval lies.
 
 use crate::{
-    effects::quantisation::grid,
     problem::{Drive, Series},
     report::format::at_most,
 };
@@ -20,6 +19,8 @@ const RESET: f64 = 3.0;
 const COUNTED: f64 = 0.5;
 /// Variance of a share that may be anything from 0 to 1: what is known before the counter is asked.
 const ANYTHING: f64 = 1.0 / 12.0;
+/// Decimal digits behind the point up to which a counter may round.
+const DIGITS: i32 = 9;
 /// Standard deviations in a median of absolute values.
 const OF_MEDIAN: f64 = 1.4826;
 
@@ -108,12 +109,25 @@ fn noise_ah(steps: &[Step], ah: &[f64]) -> Option<f64> {
         .map(|step| (step.counted_ah - step.from_ah - 0.5 * step.change_ah).abs())
         .collect();
     let scatter = OF_MEDIAN * super::series::median(&mut off)?;
-    let mut read: Vec<f64> = ah.iter().copied().filter(|ah| ah.is_finite()).collect();
-    read.sort_unstable_by(f64::total_cmp);
-    read.dedup();
-    // Each of two readings is off by up to half a step, evenly: variance 1/12 of its square each.
-    let rounding = grid(&read).unwrap_or_default() / 6f64.sqrt();
+    // Each of two readings is off by up to half a digit, evenly: variance 1/12 of its square each.
+    let rounding = last_digit(ah) / 6f64.sqrt();
     Some(scatter.max(rounding)).filter(|noise| *noise > 0.0)
+}
+
+/// The last decimal digit that is in use. (A grid of the readings would be no rounding: at a constant current any counter climbs in even
+/// steps.)
+fn last_digit(ah: &[f64]) -> f64 {
+    let read = || ah.iter().filter(|ah| ah.is_finite());
+    let is_whole = |digit: f64| {
+        read().all(|ah| {
+            let digits = ah / digit;
+            (digits - digits.round()).abs() < 1e-3
+        })
+    };
+    (0..=DIGITS)
+        .map(|digits| 0.1f64.powi(digits))
+        .find(|digit| is_whole(*digit))
+        .unwrap_or_default()
 }
 
 #[cfg(test)]
@@ -151,11 +165,15 @@ mod tests {
     fn charge_follows_the_counter_wherever_the_current_changed() {
         for share in [0.0, 0.2, 0.5, 1.0] {
             let (mut drive, ah, flowed) = logged(share, 1.0);
-            // It ends as it began, so that what is lost on the way up is not on the way down: look at one way only.
             let told = between_rows(&drive, &ah).unwrap();
-            for row in (1..drive.len()).filter(|row| drive.reference[*row] != drive.reference[row - 1]) {
+            for row in
+                (1..drive.len()).filter(|row| drive.reference[*row] != drive.reference[row - 1])
+            {
                 let there = told.mean_share[row];
-                assert!((there - share).abs() < 0.06, "row {row}: {there} for {share}");
+                assert!(
+                    (there - share).abs() < 0.06,
+                    "row {row}: {there} for {share}"
+                );
             }
             drive.mean_share = Some(told.mean_share);
             let counted = drive.charge()[drive.len() - 1] / 3600.0;
@@ -168,11 +186,11 @@ mod tests {
         let (drive, mut ah, _) = logged(1.0, 1.0);
         // The counter begins anew with each discharge.
         let mut zero = 0.0;
-        for row in 1..ah.len() {
+        for (row, ah) in ah.iter_mut().enumerate().skip(1) {
             if drive.reference[row] > 0.0 && drive.reference[row - 1] == 0.0 {
-                zero = ah[row];
+                zero = *ah;
             }
-            ah[row] -= zero;
+            *ah -= zero;
         }
         let told = between_rows(&drive, &ah).unwrap();
         for row in 11..drive.len() {

@@ -67,6 +67,8 @@ pub struct FittedModel {
     pub effects: Vec<(String, Vec<(String, f64)>)>,
     /// What the base differs by, within what the model file says it does not know.
     pub nuisance: crate::effects::chain::Nuisance,
+    /// Whether that is a battery.
+    pub of_battery: bool,
     /// Whether the reference was found to go from row to row in a smooth course.
     pub smooth_reference: bool,
 }
