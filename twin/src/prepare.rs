@@ -695,10 +695,10 @@ fn model_effects(model: &Model, item: &mut Item) -> Result<(), Failure> {
         .filter(|(id, _)| registry::of_battery(id) == battery)
         .cloned()
         .collect();
+    checks::moments(model, problem)?;
     if problem.modelled.is_empty() {
         return Ok(());
     }
-    checks::moments(model, problem)?;
     let changed = modelled_change(problem);
     let Base::Sensor(base) = &mut problem.base else {
         return Ok(());

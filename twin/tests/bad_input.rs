@@ -891,6 +891,37 @@ fn a_delay_beyond_the_recording() {
 }
 
 #[test]
+fn voltages_that_were_read_beyond_the_recording() {
+    let recording = "t_s,i_ref_a,v_cell_v\n".to_owned()
+        + &rows(300, |t| {
+            format!("{t},{},{}", current(t), 3.7 - 0.1 * current(t))
+        });
+    for (value, expected) in [
+        (
+            "1e6",
+            "found 1000000, expected less than the recording's 29.900 s",
+        ),
+        (
+            "inf",
+            "a time in s, below 0 if voltages were read after the current",
+        ),
+    ] {
+        let model = format!(
+            "schema = 1\n[battery]\ncapacity_ah = 2\nalignment_s = {value}\nocv = [[0, 3.0], [1, 4.0]]\nohmic_resistance_ohm = 0.1\n"
+        );
+        says(
+            &explained(&model, &recording),
+            &["m.toml", "battery.alignment_s", expected],
+        );
+    }
+    let model = "schema = 1\n[sensor]\nalignment_s = -1e6\n";
+    says(
+        &explained(model, &good()),
+        &["m.toml, key sensor.alignment_s: found -1000000", "29.900 s"],
+    );
+}
+
+#[test]
 fn columns_by_other_names_are_hinted_at() {
     let renamed = good().replacen("t_s,i_ref_a,i_meas_a", "time,current_ref,current", 1);
     says(

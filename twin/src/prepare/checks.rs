@@ -7,7 +7,7 @@ use crate::{
     effects::{self, Stage, scene::integral},
     failure::Failure,
     model::{Model, Sensor},
-    problem::{BatteryBase, Drive, Observed, Problem, View},
+    problem::{Base, BatteryBase, Drive, Observed, Problem, View},
     range::range,
     report::format::count,
 };
@@ -157,19 +157,28 @@ pub(super) fn moments(model: &Model, problem: &Problem) -> Result<(), Failure> {
     let t_s = &problem.drive.t_s;
     let spans = problem.drive.segments.iter();
     let span_s: f64 = spans.map(|rows| t_s[rows.end - 1] - t_s[rows.start]).sum();
+    let within = |key: &str, value: f64| {
+        if value.abs() <= span_s {
+            return Ok(());
+        }
+        Err(Failure::Input(format!(
+            "{}, key {key}: found {}, expected less than the recording's {}",
+            model.source,
+            number(value),
+            seconds(span_s)
+        )))
+    };
+    match &problem.base {
+        Base::Sensor(base) => within("sensor.alignment_s", base.alignment_s)?,
+        Base::Battery(base) => within("battery.alignment_s", base.alignment_s)?,
+    }
     for (id, values) in &problem.modelled {
         let Some(card) = effects::find_with(id, values.len()).map(|effect| effect.card()) else {
             continue;
         };
         for (parameter, value) in card.parameters.iter().zip(values) {
-            if card.stage == Stage::Clock && parameter.unit == "s" && value.abs() > span_s {
-                return Err(Failure::Input(format!(
-                    "{}, key effects.{id}.{}: found {}, expected less than the recording's {}",
-                    model.source,
-                    parameter.name,
-                    number(*value),
-                    seconds(span_s)
-                )));
+            if card.stage == Stage::Clock && parameter.unit == "s" {
+                within(&format!("effects.{id}.{}", parameter.name), *value)?;
             }
         }
     }
