@@ -195,7 +195,7 @@ fn key(model: &Model) -> Key {
         bits(
             &[
                 nuisance.soc_shift.as_slice(),
-                // What no start is taken for.
+                // Where the starts end, of which there may be any number.
                 &[f64::NAN],
                 nuisance.ocv_bend_v.as_slice(),
                 &[nuisance.resistance, nuisance.alignment_s],

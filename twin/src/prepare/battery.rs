@@ -19,8 +19,8 @@ use crate::{
 const CELL: &str = "v_cell_v";
 pub(super) const PACK: &str = "v_pack_v";
 const SOC: &str = "soc_pct";
-/// Column of a tester's charge counter.
-pub(super) const COUNTER: &str = "ah_meas_ah";
+/// Column of a tester's charge counter, in Ah.
+const COUNTER: &str = "ah_meas_ah";
 /// Columns of the current, in the order in which they are looked for.
 const CURRENTS: [&str; 2] = ["i_ref_a", "i_meas_a"];
 
@@ -67,12 +67,13 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
     let parts = series::drive(work.drive_frame(), found);
     let mut drive = parts.drive;
     work.surroundings(&mut drive, &parts.rows);
-    if let Some(ah) = work.drive_frame().column(COUNTER) {
-        let ah: Vec<f64> = parts.rows.iter().map(|row| ah[*row]).collect();
-        if let Some(told) = counter::between_rows(&drive, &ah) {
-            work.remark(told.remark);
-            drive.mean_share = Some(told.mean_share);
-        }
+    let counter_ah = work.drive_frame().column(COUNTER);
+    let counter_ah: Option<Vec<f64>> =
+        counter_ah.map(|ah| parts.rows.iter().map(|row| ah[*row]).collect());
+    let told = counter_ah.as_deref();
+    if let Some(told) = told.and_then(|ah| counter::between_rows(&drive, ah)) {
+        work.remark(told.remark);
+        drive.mean_share = Some(told.mean_share);
     }
     let mut items = Vec::new();
     for (view, name) in views {
@@ -133,7 +134,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             &mut base,
             &start::Readings {
                 drive: &drive,
-                rows: &parts.rows,
+                counter_ah: counter_ah.as_deref(),
                 clocks: &parts.clocks,
                 observed: &observed,
                 view,

@@ -25,8 +25,8 @@ const COUNTER_SHARE: f64 = 0.02;
 /// What was recorded of a battery.
 pub(super) struct Readings<'a> {
     pub drive: &'a Drive,
-    /// Row of the frame that each row of the drive is from.
-    pub rows: &'a [usize],
+    /// A tester's charge counter on the drive's rows, in Ah, if there is one.
+    pub counter_ah: Option<&'a [f64]>,
     /// Clock of each segment.
     pub clocks: &'a [usize],
     pub observed: &'a Observed,
@@ -48,9 +48,6 @@ pub(super) fn find(
     battery: &Battery,
 ) {
     let drive = readings.drive;
-    let counter = work.drive_frame().column(super::battery::COUNTER);
-    let counter: Option<Vec<f64>> =
-        counter.map(|ah| readings.rows.iter().map(|row| ah[*row]).collect());
     let mut end = 1.0;
     let mut bridged = 0;
     for (index, own) in drive.segments.iter().enumerate() {
@@ -59,8 +56,8 @@ pub(super) fn find(
             let gap_s = drive.t_s[own.start] - drive.t_s[own.start - 1];
             let ends_a = [drive.reference[own.start - 1], drive.reference[own.start]];
             let before = &drive.segments[index - 1];
-            let counted = counter
-                .as_ref()
+            let counted = readings
+                .counter_ah
                 .and_then(|ah| over_gap(ah, drive, before.clone(), own.start, battery.capacity_ah));
             match counted {
                 Some(ah) => excess_ah = ah - gap_ah(ends_a, gap_s, 0.0, 1.0),
