@@ -2,7 +2,7 @@
 //! value. A column with anything else in it is left out.
 //!
 //! Read are fields between semicolons or tabs as well, if the header has no comma, and there a decimal comma, if it is that
-//! of all numbers of the file.
+//! of all numbers of the file. A first line such as `sep=;`, which a spreadsheet writes for itself, says which it is.
 //!
 //! Lines are split here and not by a general CSV reader, because every message must name the line it is about.
 
@@ -44,15 +44,27 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
     };
     let text = text(source, bytes)?;
     let mut lines = Lines::new(text);
-    let Some((header_line, header)) = lines.next() else {
+    let mut first = lines.next();
+    let stated = match first {
+        Some((line, text)) => stated_separator(source, line, text)?,
+        None => None,
+    };
+    if stated.is_some() {
+        first = lines.next();
+    }
+    let Some((header_line, header)) = first else {
+        let found = match stated {
+            Some(_) => "nothing but a separator",
+            None => "an empty file",
+        };
         return Err(fault(
             Kind::Empty,
             Place::default(),
-            "an empty file".into(),
+            found.into(),
             "a header line",
         ));
     };
-    let separator = separator(header);
+    let separator = stated.unwrap_or_else(|| separator(header));
     let names = names(source, header_line, header, separator)?;
 
     // Lines are of about the same length.
@@ -136,6 +148,30 @@ fn text<'a>(source: &str, bytes: &'a [u8]) -> Result<&'a str> {
             "UTF-8 text",
         )
     })
+}
+
+/// What a first line such as `sep=;` says to stand between fields, if it is one.
+fn stated_separator(source: &str, line: u64, text: &str) -> Result<Option<u8>> {
+    let text = text.trim_end_matches('\r');
+    let bare = text
+        .strip_prefix('"')
+        .and_then(|text| text.strip_suffix('"'));
+    let text = bare.unwrap_or(text);
+    let Some((key, separator)) = text.split_once('=') else {
+        return Ok(None);
+    };
+    match (key.eq_ignore_ascii_case("sep"), separator.as_bytes()) {
+        (true, &[separator @ (b',' | b';' | b'\t')]) => Ok(Some(separator)),
+        // A header of one column could be called so; nobody's is.
+        (true, _) => Err(Error::new(
+            Kind::Unsupported,
+            source,
+            Place::line(line),
+            quoted(text),
+            "sep= with a comma, a semicolon or a tab",
+        )),
+        (false, _) => Ok(None),
+    }
 }
 
 /// What stands between fields: a comma, or where the header has none outside of quotation marks, a semicolon or a tab.

@@ -46,6 +46,37 @@ fn takes_what_spreadsheets_write() {
     assert_eq!(read.table().line(1), 4);
 }
 
+#[test]
+fn a_separator_that_a_spreadsheet_states_is_no_header() {
+    let rows = [["t_s", "i_ref_a"], ["0", "1,5"], ["1", "-2,25"]];
+    let written = |separator: &str| rows.map(|row| row.join(separator)).join("\r\n");
+    for (first, separator) in [
+        ("sep=;", ";"),
+        ("\u{feff}SEP=;", ";"),
+        ("\"sep=;\"", ";"),
+        ("sep=\t", "\t"),
+    ] {
+        let read = recording(&format!("{first}\r\n{}\r\n", written(separator))).unwrap();
+        assert_eq!(read.need("i_ref_a").unwrap(), [1.5, -2.25], "{first}");
+        assert_eq!(read.table().line(1), 4, "{first}");
+    }
+    // A comma that is stated separates where the header alone would be read otherwise.
+    let read = recording("sep=,\nt_s,x\n0,1\n1,2\n").unwrap();
+    assert_eq!(read.need("x").unwrap(), [1.0, 2.0]);
+    for (text, found) in [
+        (
+            "sep=|\nt_s|x\n0|1\n",
+            "r.csv, line 1: found \"sep=|\", expected sep= with a comma, a semicolon or a tab",
+        ),
+        (
+            "sep=;\r\n",
+            "r.csv: found nothing but a separator, expected a header line",
+        ),
+    ] {
+        assert_eq!(recording(text).unwrap_err().to_string(), found);
+    }
+}
+
 /// Each fault with the sentence it is told in.
 #[test]
 fn every_fault_has_its_place() {
