@@ -161,18 +161,28 @@ pub struct Workbench<'a> {
     white: Option<(Whitening, Vec<f64>)>,
 }
 
+/// A bend of the open-circuit voltage that is less than this share of the mismatch, rms, is no reason for it.
+const BENT: f64 = 0.03;
+/// Lines that may bend at most, those that may most.
+const MOST_BENDS: usize = 16;
+
 /// See [`Workbench::bends`].
-fn bends(problem: &Problem) -> Vec<(usize, f64)> {
+fn bends(problem: &Problem, mismatch: f64) -> Vec<(usize, f64)> {
     let Base::Battery(base) = &problem.base else {
         return Vec::new();
     };
     let lines = 0..base.ocv.len().saturating_sub(1);
     let seen_v = problem.noise + problem.accuracy.zero;
-    lines
+    let least_v = seen_v.max(BENT * mismatch);
+    let mut bends: Vec<(usize, f64)> = lines
         .map(|line| (line, bend_v(&base.ocv, line)))
-        .filter(|(_, bend_v)| problem.view == View::Voltage && *bend_v > seen_v)
+        .filter(|(_, bend_v)| problem.view == View::Voltage && *bend_v > least_v)
         .map(|(line, bend_v)| (line, bend_v / base.cells))
-        .collect()
+        .collect();
+    bends.sort_by(|a, b| b.1.total_cmp(&a.1));
+    bends.truncate(MOST_BENDS);
+    bends.sort_unstable_by_key(|(line, _)| *line);
+    bends
 }
 
 /// A model to the last digit.
@@ -301,7 +311,7 @@ impl<'a> Workbench<'a> {
             chain,
             scale,
             starts: Start::all(problem, &rows),
-            bends: bends(problem),
+            bends: bends(problem, scale.mismatch),
             apart: reads_apart(problem),
             marks,
             modelled,
