@@ -1,7 +1,7 @@
 //! From problems to named effects: fit, select, say where, how sure and what is left.
 //!
-//! One way: `course` asks how the reference goes from row to row, [`workbench`] makes a problem ready (`apart`: whether a tester read voltages at another moment than currents; `censored`: what readings tell
-//! behind a threshold, steps or rails of the model file), [`screen`] asks which effects could account for what is left, [`fit`] fits
+//! One way: `course` asks how the reference goes from row to row, [`workbench`] makes a problem ready (`apart`: whether a tester read
+//! voltages at another moment than currents; `censored`: what readings tell behind a threshold, steps or rails of the model file), [`screen`] asks which effects could account for what is left, [`fit`] fits
 //! them, with [`slope`]s, [`normal`] equations and a [`robust`] loss, and with what the model file leaves open (`starts`);
 //! [`held_out`] says what a fit is worth on rows that it was not made of, and [`select`] decides. [`intervals`] and [`locate`] say how
 //! sure and where; `trust`, [`shape`] and `unfitted` take back names that the recording or other files do not bear out, `strays`

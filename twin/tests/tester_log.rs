@@ -156,25 +156,23 @@ fn a_pulse_test_is_explained_by_what_its_counter_says() {
     let fitted = cell(1.0, &pulses());
     let other = cell(1.0, &[(60, 0.0), (3300, 30.0), (1800, 0.0)]);
     let every = [2, 60];
-    let folder = tempfile::tempdir().unwrap();
-    let (report, left_v) = said(
-        folder.path(),
-        &model(),
-        &log(&fitted, every, true, 1),
-        &log(&other, every, true, 2),
-    );
+    let explained = |counter: bool| {
+        let folder = tempfile::tempdir().unwrap();
+        let fitted = log(&fitted, every, counter, 1);
+        said(
+            folder.path(),
+            &model(),
+            &fitted,
+            &log(&other, every, true, 2),
+        )
+    };
+    let (report, left_v) = explained(true);
+    let (blind, left_blind_v) = explained(false);
     assert!(!names(&report).is_empty(), "{}", report["summary"]);
     assert!(
         remarks(&report).contains("ah_meas_ah tells how the current goes"),
         "{}",
         report["remarks"]
-    );
-    let folder = tempfile::tempdir().unwrap();
-    let (blind, left_blind_v) = said(
-        folder.path(),
-        &model(),
-        &log(&fitted, every, false, 1),
-        &log(&other, every, true, 2),
     );
     let relaxes = |id: &&str| ["polarisation", "diffusion"].contains(id);
     assert!(names(&report).iter().all(relaxes), "{}", report["summary"]);

@@ -140,8 +140,8 @@ pub struct Workbench<'a> {
     pub blocks: Vec<Range<usize>>,
     /// At which states of charge operations begin, where that is not known exactly.
     pub starts: Vec<Start>,
-    /// Lines of the open-circuit voltage's table that may be bent by more than what readings are off by, with by how much, in V of one
-    /// cell.
+    /// Lines of the open-circuit voltage's table that may be bent by more than what readings are off by and than a part of the mismatch,
+    /// with by how much, in V of one cell.
     pub(super) bends: Vec<(usize, f64)>,
     /// Whether voltages were read at another moment than the currents of their rows.
     pub(super) apart: bool,
