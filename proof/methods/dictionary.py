@@ -25,8 +25,11 @@ HALF_SUPPLY_OVER_SPAN = 1.25
 ZERO_C_IN_K = 273.15
 # Arrhenius temperature of the resistance of usual lithium-ion cells, 1500 … 4000 K.
 USUAL_B_K = 2000.0
-# Entries of one effect in one model: one, but several RC branches and lines, and an upper and a lower rail.
-MOST_OF_ONE = {"polarisation": 3, "hum": 3, "clipping": 2}
+# States of charge that a recording has to pass, as twin's has, for a rise near full to be asked for.
+FULL_WITH_EMPTY = (0.3, 0.8)
+# Entries of one effect in one model: one, but several RC branches and lines, an upper and a lower rail, a rise at either end of the
+# charge.
+MOST_OF_ONE = {"polarisation": 3, "hum": 3, "clipping": 2, "resistance-soc": 2}
 
 
 @dataclass(frozen=True)
@@ -384,6 +387,11 @@ def battery_entries(recording: Series) -> list[Entry]:
     gammas, knees = np.geomspace(3, 3000, 7), np.array([0.1, 0.2, 0.35, 0.6])
     out += spread("ocv-hysteresis", ocv_hysteresis, "gamma", gammas, coefficients=(("m_v", 0.0),), positive=True)
     out += spread("resistance-soc", soc_resistance, "knee_soc", knees, coefficients=(("rise", 0.0),), positive=True)
+    if (soc := recording.other["soc"]).min() <= FULL_WITH_EMPTY[0] and soc.max() >= FULL_WITH_EMPTY[1]:
+        knees_full = np.array([0.7, 0.85, 0.92, 0.96])
+        out += spread(
+            "resistance-soc", full_resistance, "knee_full_soc", knees_full, coefficients=(("rise_full", 0.0),), positive=True
+        )
     if recording.battery.resistance_exact and recording.battery.resistance_ohm:
         # One that is uncertain is a nuisance.
         out.append(Entry("resistance", lambda s, _: -ohms(s) * s.x, coefficients=(("scale", 1.0),)))
@@ -446,6 +454,11 @@ def ocv_hysteresis(series: Series, gamma: float) -> Array:
 def soc_resistance(series: Series, knee: float) -> Array:
     """−R·i·(1 − SoC/knee) below the knee."""
     return -ohms(series) * series.x * np.maximum(1.0 - series.other["soc"] / knee, 0.0)
+
+
+def full_resistance(series: Series, knee: float) -> Array:
+    """−R·i·(SoC − knee)/(1 − knee) above the knee."""
+    return -ohms(series) * series.x * np.maximum((series.other["soc"] - knee) / (1.0 - knee), 0.0)
 
 
 def arrhenius(series: Series, _: float) -> Array:

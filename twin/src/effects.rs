@@ -48,7 +48,7 @@ use crate::problem::{Problem, View};
 use scene::{Scale, Scene};
 
 /// Every effect, in the order of the documentation's table.
-pub static LIBRARY: [&dyn Effect; 38] = [
+pub static LIBRARY: [&dyn Effect; 39] = [
     &offset::Offset,
     &gain::Gain,
     &offset_temperature::OffsetTemperature,
@@ -84,7 +84,8 @@ pub static LIBRARY: [&dyn Effect; 38] = [
     &ocv_hysteresis::OcvHysteresis,
     &resistance::Resistance,
     &resistance_temperature::ResistanceTemperature,
-    &resistance_soc::ResistanceSoc,
+    &resistance_soc::AT_EMPTY,
+    &resistance_soc::AT_BOTH_ENDS,
     &cell_self_heating::CellSelfHeating,
     &entropic::Entropic,
 ];
@@ -601,7 +602,10 @@ mod tests {
             ("ocv-hysteresis", &["m_v", "gamma"]),
             ("resistance", &["scale"]),
             ("resistance-temperature", &["b_k"]),
-            ("resistance-soc", &["rise", "knee_soc"]),
+            (
+                "resistance-soc",
+                &["rise", "knee_soc", "rise_full", "knee_full_soc"],
+            ),
             ("cell-self-heating", &["rth_k_per_w", "tau_s"]),
             ("entropic", &["v_per_k"]),
         ];
@@ -722,7 +726,7 @@ mod tests {
                 "ocv-hysteresis" => vec![0.02, 300.0],
                 "resistance" => vec![1.6],
                 "resistance-temperature" => vec![2500.0],
-                "resistance-soc" => vec![2.0, 0.9],
+                "resistance-soc" => vec![2.0, 0.9, 1.0, 0.3],
                 "cell-self-heating" => vec![20.0, 30.0],
                 "entropic" => vec![4e-4],
                 _ => continue,
@@ -763,6 +767,7 @@ mod tests {
             reading_step_s: 0.5,
             span_s: 150.0,
             capacity_ah: 2.0,
+            soc: (0.1, 0.95),
             ..Scale::default()
         };
         let clues = Clues {

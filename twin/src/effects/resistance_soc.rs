@@ -4,29 +4,50 @@ use super::scene::{Scale, Scene};
 use super::{Card, Clues, Effect, IDEALISED, Parameter, Search, Stage};
 use crate::problem::{Problem, View};
 
-/// See [`CARD`].
+/// Towards empty, or towards either end: one id, and as many parameters as that needs.
 #[derive(Debug)]
-pub struct ResistanceSoc;
+pub struct ResistanceSoc {
+    card: &'static Card,
+}
 
-static CARD: Card = Card {
-    id: "resistance-soc",
-    statement: "The resistance rises when the battery is nearly empty.",
-    equation: "R(SoC) = R·(1 + rise·(1 − SoC/knee)) below the knee",
-    parameters: &[
-        Parameter::new("rise", "1", 0.0, Search::Linear),
-        Parameter::new("knee_soc", "1", 0.3, Search::Smooth)
-            .within(0.0, 1.0)
-            .open(),
-    ],
-    shows: "low state of charge",
-    looks_like: &["resistance-temperature"],
-    separated_by: "pulses at several states of charge and one temperature",
-    stage: Stage::BatteryResistance,
-};
+/// Towards empty.
+pub static AT_EMPTY: ResistanceSoc = ResistanceSoc { card: &CARDS[0] };
+/// Towards empty and towards full: the exchange current of an electrode goes with √(x·(1 − x)), x the share of its sites that are
+/// taken (Doyle, Fuller, Newman 1993), and falls at both ends.
+pub static AT_BOTH_ENDS: ResistanceSoc = ResistanceSoc { card: &CARDS[1] };
+
+static PARAMETERS: [Parameter; 4] = [
+    Parameter::new("rise", "1", 0.0, Search::Linear),
+    Parameter::new("knee_soc", "1", 0.3, Search::Smooth)
+        .within(0.0, 1.0)
+        .open(),
+    Parameter::new("rise_full", "1", 0.0, Search::Linear),
+    Parameter::new("knee_full_soc", "1", 0.8, Search::Smooth)
+        .within(0.0, 1.0)
+        .open(),
+];
+
+static CARDS: [Card; 2] = [
+    card(PARAMETERS.as_slice().split_at(2).0),
+    card(PARAMETERS.as_slice()),
+];
+
+const fn card(parameters: &'static [Parameter]) -> Card {
+    Card {
+        id: "resistance-soc",
+        statement: "The resistance rises when the battery is nearly empty, or nearly full.",
+        equation: "R(SoC) = R·(1 + rise·(1 − SoC/knee)) below the knee, R·(1 + rise_full·(SoC − knee_full)/(1 − knee_full)) above knee_full; rise_full: 0 without it",
+        parameters,
+        shows: "low state of charge, and the highest",
+        looks_like: &["resistance-temperature"],
+        separated_by: "pulses at several states of charge and one temperature",
+        stage: Stage::BatteryResistance,
+    }
+}
 
 impl Effect for ResistanceSoc {
     fn card(&self) -> &'static Card {
-        &CARD
+        self.card
     }
 
     fn applies(&self, problem: &Problem) -> bool {
@@ -34,15 +55,27 @@ impl Effect for ResistanceSoc {
     }
 
     fn bounds(&self, parameter: usize, _scale: &Scale) -> (f64, f64) {
-        if parameter == 0 {
-            (0.0, 30.0)
-        } else {
-            (0.05, 1.0)
+        match parameter {
+            0 | 2 => (0.0, 30.0),
+            1 => (0.05, 1.0),
+            _ => (0.0, 0.98),
         }
     }
 
-    fn starts(&self, _scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
-        [0.15, 0.3, 0.5, 0.8].map(|knee| vec![0.1, knee]).to_vec()
+    fn starts(&self, scale: &Scale, _clues: &Clues<'_>) -> Vec<Vec<f64>> {
+        let towards_empty = [0.15, 0.3, 0.5, 0.8].map(|knee| vec![0.1, knee]);
+        if self.card.parameters.len() == 2 {
+            return towards_empty.to_vec();
+        }
+        // Over a part of the charge a rise towards one end is a course like any other: of the temperature, or of a relaxation.
+        let (low, high) = scale.soc;
+        if low > PARAMETERS[1].off || high < PARAMETERS[3].off {
+            return Vec::new();
+        }
+        towards_empty
+            .iter()
+            .flat_map(|empty| [0.7, 0.9].map(|knee| [empty.as_slice(), &[0.1, knee]].concat()))
+            .collect()
     }
 
     /// Two straight lines for a curve.
@@ -52,10 +85,16 @@ impl Effect for ResistanceSoc {
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         let (rise, knee) = (values[0], values[1]);
+        let full = values.get(2).zip(values.get(3));
         if let Some(battery) = &mut scene.battery {
             for (factor, soc) in battery.factor.iter_mut().zip(&battery.soc) {
                 if *soc < knee {
                     *factor *= 1.0 + rise * (1.0 - soc / knee);
+                }
+                if let Some((rise, knee)) = full
+                    && soc > knee
+                {
+                    *factor *= 1.0 + rise * (soc - knee) / (1.0 - knee);
                 }
             }
         }

@@ -50,6 +50,8 @@ pub struct Scale {
     pub operation_s: f64,
     /// Capacity of the battery in Ah, 0 without one.
     pub capacity_ah: f64,
+    /// Lowest and highest state of charge of the drive by design, 0 … 1; both 0 without a battery.
+    pub soc: (f64, f64),
     /// Ohmic resistance of one cell by design in Ω.
     pub resistance_ohm: f64,
     /// Averaging window by design in s.
@@ -758,6 +760,17 @@ impl<'a> Scene<'a> {
         scene.onto_rows();
         scene.signal
     }
+}
+
+/// The lowest and the highest state of charge that a drive passes, by design; none without a row.
+pub fn charge_range(base: &BatteryBase, drive: &Drive) -> Option<(f64, f64)> {
+    let mut battery = Battery::new(base, drive);
+    battery.count(drive, &drive.reference);
+    let passed = battery.soc.iter().filter(|soc| soc.is_finite());
+    passed.fold(None, |range, &soc| {
+        let (low, high) = range.unwrap_or((soc, soc));
+        Some((f64::min(low, soc), f64::max(high, soc)))
+    })
 }
 
 impl<'a> Battery<'a> {

@@ -18,7 +18,7 @@ use super::steady::Steady;
 use super::whiten::Whitening;
 use crate::effects::chain::{Begun, Chain, Change, Nuisance, Variation};
 use crate::effects::ocv::bend_v;
-use crate::effects::scene::{ROUNDS, Scale};
+use crate::effects::scene::{ROUNDS, Scale, charge_range};
 use crate::effects::{Clues, Effect, LIBRARY, Mark, Parameter, Stage, find_with};
 use crate::problem::{Base, Coloured, Drive, Moments, Problem, Series, View, evenly};
 
@@ -879,6 +879,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         Base::Battery(base) => {
             scale.capacity_ah = base.capacity_ah;
             scale.resistance_ohm = base.resistance_ohm / base.cells;
+            scale.soc = charge_range(base, drive).unwrap_or_default();
         }
     }
     scale
