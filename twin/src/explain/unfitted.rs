@@ -204,21 +204,46 @@ pub(super) fn veto(
             .fold(0.0, f64::max)
     };
     while !selection.named.is_empty() {
-        let found = (0..selection.fit.model.members.len())
-            .map(|index| {
-                let without = fit::fit(bench, &selection.fit.model.without(index), None);
+        let count = selection.fit.model.members.len();
+        let worse_with = |out: Vec<Vec<usize>>| {
+            let tried = out.into_iter().map(|out| {
+                let without = out
+                    .iter()
+                    .rev()
+                    .fold(selection.fit.model.clone(), |model, index| {
+                        model.without(*index)
+                    });
+                let without = fit::fit(bench, &without, None);
                 let ratio = worst(&selection.fit.model, &without.model);
-                (index, without, ratio)
-            })
-            .max_by(|a, b| a.2.total_cmp(&b.2));
-        let Some((index, without, ratio)) = found.filter(|(_, _, ratio)| *ratio > WORSE) else {
+                (out, without, ratio)
+            });
+            tried
+                .max_by(|a, b| a.2.total_cmp(&b.2))
+                .filter(|(_, _, ratio)| *ratio > WORSE)
+        };
+        let single = (0..count).map(|index| vec![index]).collect();
+        // Two that make up for each other here show there only if both are left out.
+        let pairs = || {
+            let pairs = (0..count).flat_map(|one| (one + 1..count).map(move |two| vec![one, two]));
+            pairs.collect()
+        };
+        let Some((out, without, ratio)) = worse_with(single).or_else(|| worse_with(pairs())) else {
             break;
         };
-        let id = selection.fit.model.members[index].id();
-        vetoed.push(id);
+        let ids: Vec<&'static str> = out
+            .iter()
+            .map(|index| selection.fit.model.members[*index].id())
+            .collect();
+        let verb = if ids.len() == 1 {
+            "fits here, but makes"
+        } else {
+            "fit here, but make"
+        };
         selection.refused.push(format!(
-            "{id}: fits here, but makes the error in a file that was not fitted {ratio:.2} times as large"
+            "{}: {verb} the error in a file that was not fitted {ratio:.2} times as large",
+            ids.join(" with ")
         ));
+        vetoed.extend(ids);
         selection.fit = fit::polish(bench, &without);
         selection.rename(bench);
     }
