@@ -25,6 +25,8 @@ use crate::{
 
 /// Version of the format.
 pub const SCHEMA: u32 = 1;
+/// A cell may begin fuller than the full charge that the table's 1 stands for, or emptier than its 0: by at most this.
+pub const BEYOND_SOC: f64 = 0.1;
 
 /// What stands between the reference and the reading.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
@@ -134,7 +136,7 @@ pub struct Battery {
     pub ocv: Vec<(f64, f64)>,
     /// The file that it is from, if it is from one.
     pub ocv_file: Option<PathBuf>,
-    /// State of charge at the start, 0 … 1, if known.
+    /// State of charge at the start, 0 … 1 or at most [`BEYOND_SOC`] beyond, if known.
     pub initial_soc: Option<f64>,
     /// Its standard uncertainty.
     pub initial_soc_uncertainty: f64,
@@ -535,8 +537,8 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         range(
             "initial_soc",
             soc,
-            (0.0..=1.0).contains(&soc),
-            "a state of charge from 0 to 1; left out: taken from the recording",
+            (-BEYOND_SOC..=1.0 + BEYOND_SOC).contains(&soc),
+            "a state of charge from 0 to 1, or little beyond; left out: taken from the recording",
         )?;
     }
     range(

@@ -7,7 +7,7 @@ use std::{
 
 use toml_edit::{Array, DocumentMut, Item, Table, TableLike, Value, value};
 
-use super::Battery;
+use super::{BEYOND_SOC, Battery};
 use crate::{
     effects::{chain::Nuisance, ocv::bent},
     failure::Failure,
@@ -158,8 +158,7 @@ impl Extension<'_> {
         }
         // Where none is stated, each recording's first reading tells its own: one of this recording would be wrong for any other.
         if let Some(soc) = battery.initial_soc.filter(|_| self.shift.soc != 0.0) {
-            // Beyond 0 … 1 no model file may state it.
-            let found = (soc + self.shift.soc).clamp(0.0, 1.0);
+            let found = (soc + self.shift.soc).clamp(-BEYOND_SOC, 1.0 + BEYOND_SOC);
             set(table, "initial_soc", value(found));
             was(table, "initial_soc", soc);
         }

@@ -9,7 +9,7 @@ use crate::{
         scene::{gap_ah, mean_flow},
     },
     explain::slope::BASE_OFF,
-    model::Battery,
+    model::{BEYOND_SOC, Battery},
     problem::{BatteryBase, Drive, Observed, View},
 };
 
@@ -104,7 +104,7 @@ fn begun(
         (Some(stated), Some(seen)) => {
             let apart = (stated.0 - seen.0).abs();
             if apart <= BASE_OFF * stated.1.hypot(seen.1) {
-                return (stated.0, stated.1.max(seen.1));
+                return (weighted(stated, seen), stated.1.max(seen.1));
             }
             work.remark(format!(
                 "{name} does not begin at the stated initial_soc of {:.1} %: {} taken from its first reading",
@@ -131,6 +131,17 @@ fn begun(
             ));
             (1.0, 1.0)
         }
+    }
+}
+
+/// Mean of two values by the inverse squares of their uncertainties; the first one, if it is exact.
+fn weighted(one: Soc, other: Soc) -> f64 {
+    let (own, others) = (one.1 * one.1, other.1 * other.1);
+    let all = own + others;
+    if all > 0.0 {
+        (one.0 * others + other.0 * own) / all
+    } else {
+        one.0
     }
 }
 
@@ -173,10 +184,11 @@ fn seen(base: &BatteryBase, readings: &Readings<'_>, segment: usize) -> Option<S
         return Some((value / 100.0, OF_READING.hypot(noise / 100.0)));
     }
     let current_a = drive.reference[drive.segments[segment].start];
-    let there = inverse(&base.ocv, value + base.resistance_ohm * current_a)?;
+    let rest_v = base.cells * AT_REST_V;
+    let there = inverse(&base.ocv, value + base.resistance_ohm * current_a, rest_v)?;
     // A voltage under load says little.
     let loaded_v = 0.5 * base.resistance_ohm * current_a.abs();
-    let within_v = (base.cells * AT_REST_V + loaded_v).hypot(noise);
+    let within_v = (rest_v + loaded_v).hypot(noise);
     let within_v = within_v.hypot(there.bend_v);
     Some((there.soc, (within_v / there.slope_v).min(WORTH)))
 }
@@ -191,8 +203,9 @@ struct Place {
     bend_v: f64,
 }
 
-/// The state of charge at an open-circuit voltage.
-fn inverse(ocv: &[(f64, f64)], volts: f64) -> Option<Place> {
+/// The state of charge at an open-circuit voltage. Beyond the table its last line goes on, over `beyond_v` at most: a cell that was
+/// charged further than the table's is there, but so is one that has not relaxed.
+fn inverse(ocv: &[(f64, f64)], volts: f64, beyond_v: f64) -> Option<Place> {
     let (first, last) = (ocv.first()?, ocv.last()?);
     let lines = ocv.len().checked_sub(1).filter(|lines| *lines > 0)?;
     let slope_v = |line: usize| (ocv[line + 1].1 - ocv[line].1) / (ocv[line + 1].0 - ocv[line].0);
@@ -201,18 +214,16 @@ fn inverse(ocv: &[(f64, f64)], volts: f64) -> Option<Place> {
         from <= volts && volts <= to && to > from
     };
     let line = (0..lines).find(is_there);
-    let (line, soc) = match line {
-        Some(line) => {
-            let (from, to) = (ocv[line], ocv[line + 1]);
-            let share = (volts - from.1) / (to.1 - from.1);
-            (line, from.0 + share * (to.0 - from.0))
-        }
-        None if volts < first.1 => (0, first.0),
-        None => (lines - 1, last.0),
+    let (line, volts) = match line {
+        Some(line) => (line, volts),
+        None if volts < first.1 => (0, volts.max(first.1 - beyond_v)),
+        None => (lines - 1, volts.min(last.1 + beyond_v)),
     };
+    let slope_v = slope_v(line).max(1e-3);
+    let beyond = |soc: f64| soc.clamp(first.0 - BEYOND_SOC, last.0 + BEYOND_SOC);
     Some(Place {
-        soc,
-        slope_v: slope_v(line).max(1e-3),
+        soc: beyond(ocv[line].0 + (volts - ocv[line].1) / slope_v),
+        slope_v,
         bend_v: bend_v(ocv, line),
     })
 }
