@@ -184,6 +184,41 @@ fn a_cells_slow_polarisation_is_found_on_hwfet_and_holds_on_us06() {
     );
 }
 
+/// The pulses of the same cell show what is to be found (twin/tests/panasonic_model.rs): a quarter more near full, and more near empty.
+#[test]
+fn a_resistance_that_rises_near_full_and_near_empty_is_found_on_us06_and_holds_on_hwfet() {
+    let report = explain(&[
+        "--model",
+        "../models/panasonic-18650pf.toml",
+        "--recording",
+        "../recordings/panasonic-18650pf/25c-us06.csv",
+        "--holdout",
+        "../recordings/panasonic-18650pf/25c-hwfet.csv",
+    ]);
+    only_what_the_recording_tells(&report);
+    assert!(names(&report, "resistance-soc"), "{}", report["summary"]);
+    let effects = report["effects"].as_array().expect("effects");
+    let rises = effects
+        .iter()
+        .find(|effect| effect["id"] == "resistance-soc")
+        .and_then(|effect| effect["parameters"].as_array())
+        .expect("its parameters");
+    let value = |name: &str| {
+        let told = rises.iter().find(|parameter| parameter["name"] == name);
+        told.and_then(|parameter| parameter["value"].as_f64())
+            .expect("its value")
+    };
+    let near_full = value("rise_full");
+    assert!((0.15..0.6).contains(&near_full), "{near_full}");
+    assert!(value("rise") > 0.15, "{}", value("rise"));
+    assert!(left_on_blocks(&report) < 0.2, "{}", left_on_blocks(&report));
+    assert!(
+        left_on_other_file(&report) < 0.35,
+        "{}",
+        left_on_other_file(&report)
+    );
+}
+
 /// A pulse test; the discharges at 1C are other days' tests of the same kind of cell. Open-circuit voltage and capacity were
 /// read off the pulse test: only what takes time can be missing.
 fn leaf(more: &[&str]) -> Value {
