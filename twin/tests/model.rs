@@ -394,6 +394,14 @@ fn an_extended_model_in_another_folder_finds_its_table() {
     assert_eq!(again.ocv, [(0.0, 3.0), (1.0, 4.0)]);
     assert!((again.initial_soc.unwrap() - 0.88).abs() < 1e-12);
     assert!((again.resistance_ohm - 0.03).abs() < 1e-12);
+    // A cell may begin fuller than the full one of its table, and is read so again.
+    let fuller = Shift {
+        soc: 0.109,
+        ..Shift::default()
+    };
+    fs::write(&path, model.extended(&[], fuller, &models, &out).unwrap()).unwrap();
+    let again = Model::read(&path).unwrap().battery.unwrap();
+    assert!((again.initial_soc.unwrap() - 1.009).abs() < 1e-12);
 }
 
 #[test]

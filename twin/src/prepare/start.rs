@@ -195,7 +195,7 @@ fn seen(base: &BatteryBase, readings: &Readings<'_>, segment: usize) -> Option<S
 
 /// Where an open-circuit voltage is on the table.
 struct Place {
-    /// State of charge, 0 … 1.
+    /// State of charge, 0 … 1 or little beyond.
     soc: f64,
     /// Slope of the line that it is on, in V.
     slope_v: f64,
@@ -226,4 +226,32 @@ fn inverse(ocv: &[(f64, f64)], volts: f64, beyond_v: f64) -> Option<Place> {
         slope_v,
         bend_v: bend_v(ocv, line),
     })
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    const TABLE: [(f64, f64); 3] = [(0.0, 3.0), (0.5, 3.6), (1.0, 4.1)];
+
+    #[test]
+    fn a_voltage_beyond_the_table_is_little_beyond_it() {
+        let soc = |volts| inverse(&TABLE, volts, 0.01).unwrap().soc;
+        let close = |soc: f64, expected: f64| assert!((soc - expected).abs() < 1e-12, "{soc}");
+        close(soc(3.3), 0.25);
+        close(soc(4.105), 1.005);
+        // A charger's last volts are no charge.
+        close(soc(4.5), 1.01);
+        close(soc(2.0), -0.01 / 1.2);
+    }
+
+    #[test]
+    fn a_start_is_the_mean_of_what_is_stated_and_what_is_read_by_what_they_are_worth() {
+        let close = |soc: f64, expected: f64| assert!((soc - expected).abs() < 1e-12, "{soc}");
+        close(weighted((0.9, 0.01), (0.91, 0.01)), 0.905);
+        close(weighted((0.9, 0.01), (0.92, 0.03)), 0.902);
+        close(weighted((0.9, 0.0), (0.92, 0.03)), 0.9);
+        close(weighted((0.9, 0.0), (0.92, 0.0)), 0.9);
+    }
 }
