@@ -88,11 +88,13 @@ impl Effect for ResistanceSoc {
         let full = values.get(2).zip(values.get(3));
         if let Some(battery) = &mut scene.battery {
             for (factor, soc) in battery.factor.iter_mut().zip(&battery.soc) {
-                if *soc < knee {
+                // A cell may be little beyond empty or full: at a knee there nothing rises.
+                if *soc < knee && knee > 0.0 {
                     *factor *= 1.0 + rise * (1.0 - soc / knee);
                 }
                 if let Some((rise, knee)) = full
                     && soc > knee
+                    && *knee < 1.0
                 {
                     *factor *= 1.0 + rise * (soc - knee) / (1.0 - knee);
                 }
