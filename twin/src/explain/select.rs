@@ -292,8 +292,8 @@ impl Search<'_, '_> {
                 if missed <= placebos && missed > FLOOR {
                     // That limit is of the step at which it was added, when the others were not there: what placebos took then was
                     // mostly what the others take now.
-                    let now = screen(bench, &without, self.seed, DRAWS).placebo_p99;
-                    placebos = placebos.min(now);
+                    let with_them = screen(bench, &without, self.seed, DRAWS).placebo_p99;
+                    placebos = placebos.min(with_them);
                 }
                 let why = if missed <= placebos {
                     format!(
