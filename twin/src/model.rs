@@ -538,7 +538,7 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
             "initial_soc",
             soc,
             (-BEYOND_SOC..=1.0 + BEYOND_SOC).contains(&soc),
-            "a state of charge from 0 to 1, or little beyond; left out: taken from the recording",
+            "a state of charge from 0 to 1, or up to 0.1 beyond; left out: taken from the recording",
         )?;
     }
     range(

@@ -46,8 +46,7 @@ struct SlowTest {
 }
 
 impl SlowTest {
-    fn of_capacity(capacity_ah: f64) -> Self {
-        let test = read("25c-c20-ocv-test.csv");
+    fn of_capacity(test: &Recording, capacity_ah: f64) -> Self {
         let [i, v, ah] = ["i_ref_a", "v_cell_v", "ah_meas_ah"].map(|name| test.need(name).unwrap());
         let rows = |way: f64| {
             (0..i.len())
@@ -109,7 +108,7 @@ fn rests() -> Vec<(f64, f64)> {
 
 #[test]
 fn the_table_is_the_pulse_tests_rests_in_the_slow_tests_shape() {
-    let slow = SlowTest::of_capacity(CAPACITY_AH);
+    let slow = SlowTest::of_capacity(&read("25c-c20-ocv-test.csv"), CAPACITY_AH);
     let mut rests: Vec<(f64, f64)> = rests()
         .into_iter()
         .map(|(ah, v)| (1.0 - ah / CAPACITY_AH, v))
@@ -144,10 +143,10 @@ fn the_table_is_the_pulse_tests_rests_in_the_slow_tests_shape() {
 
 #[test]
 fn the_rests_lie_evenly_between_both_branches_with_this_capacity_alone() {
-    let rests = rests();
+    let (test, rests) = (read("25c-c20-ocv-test.csv"), rests());
     // Spread of the rests about the mean of the branches, in V, where both are there.
     let spread_v = |capacity_ah: f64| {
-        let slow = SlowTest::of_capacity(capacity_ah);
+        let slow = SlowTest::of_capacity(&test, capacity_ah);
         let off: Vec<f64> = rests
             .iter()
             .filter(|(ah, _)| (0.1..2.5).contains(ah))

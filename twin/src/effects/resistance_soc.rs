@@ -16,13 +16,20 @@ pub static AT_EMPTY: ResistanceSoc = ResistanceSoc { card: &CARDS[0] };
 /// taken (Doyle, Fuller, Newman 1993), and falls at both ends.
 pub static AT_BOTH_ENDS: ResistanceSoc = ResistanceSoc { card: &CARDS[1] };
 
+/// States of charge at which the rises usually begin: what a recording has to pass to tell one end from the other.
+const USUAL_KNEE: f64 = 0.3;
+const USUAL_KNEE_FULL: f64 = 0.8;
+/// Least part of the charge over which a rise is one, and no single point of the table: of the low end, and of the high one.
+const SHORTEST: f64 = 0.05;
+const SHORTEST_FULL: f64 = 0.02;
+
 static PARAMETERS: [Parameter; 4] = [
     Parameter::new("rise", "1", 0.0, Search::Linear),
-    Parameter::new("knee_soc", "1", 0.3, Search::Smooth)
+    Parameter::new("knee_soc", "1", USUAL_KNEE, Search::Smooth)
         .within(0.0, 1.0)
         .open(),
     Parameter::new("rise_full", "1", 0.0, Search::Linear),
-    Parameter::new("knee_full_soc", "1", 0.8, Search::Smooth)
+    Parameter::new("knee_full_soc", "1", USUAL_KNEE_FULL, Search::Smooth)
         .within(0.0, 1.0)
         .open(),
 ];
@@ -57,8 +64,8 @@ impl Effect for ResistanceSoc {
     fn bounds(&self, parameter: usize, _scale: &Scale) -> (f64, f64) {
         match parameter {
             0 | 2 => (0.0, 30.0),
-            1 => (0.05, 1.0),
-            _ => (0.0, 0.98),
+            1 => (SHORTEST, 1.0),
+            _ => (0.0, 1.0 - SHORTEST_FULL),
         }
     }
 
@@ -69,7 +76,7 @@ impl Effect for ResistanceSoc {
         }
         // Over a part of the charge a rise towards one end is a course like any other: of the temperature, or of a relaxation.
         let (low, high) = scale.soc;
-        if low > PARAMETERS[1].off || high < PARAMETERS[3].off {
+        if low > USUAL_KNEE || high < USUAL_KNEE_FULL {
             return Vec::new();
         }
         towards_empty
