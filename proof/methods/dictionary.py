@@ -105,6 +105,9 @@ def nuisances(series: Series) -> Array:
         columns = np.column_stack([columns, -series.x])
     if not series.battery.soc_exact:
         columns = np.column_stack([columns, series.other["slope_v"]])
+    if not series.battery.current_zero_exact:
+        # Each recording has a zero of its own: what was found in one says nothing of another.
+        columns = np.column_stack([columns, parasitic(series, 0.0) * series.fitted])
     return columns
 
 
@@ -378,7 +381,6 @@ def battery_entries(recording: Series) -> list[Entry]:
     step, span = recording.step_s, recording.span_s
     out = [
         Entry("coulombic-efficiency", lost_charge, coefficients=(("lost_share", 0.0),), positive=True),
-        Entry("parasitic-load", parasitic, coefficients=(("load_a", 0.0),), positive=True),
         Entry("capacity", capacity, coefficients=(("relative_change", 0.0),)),
     ]
     out += spread("polarisation", polarisation, "tau_s", times(step, max(span / 2, 4 * step), 2.5), positive=True)
@@ -392,6 +394,9 @@ def battery_entries(recording: Series) -> list[Entry]:
         out += spread(
             "resistance-soc", full_resistance, "knee_full_soc", knees_full, coefficients=(("rise_full", 0.0),), positive=True
         )
+    if recording.battery.current_zero_exact:
+        # One that is uncertain is a nuisance.
+        out.insert(1, Entry("parasitic-load", parasitic, coefficients=(("load_a", 0.0),), positive=True))
     if recording.battery.resistance_exact and recording.battery.resistance_ohm:
         # One that is uncertain is a nuisance.
         out.append(Entry("resistance", lambda s, _: -ohms(s) * s.x, coefficients=(("scale", 1.0),)))

@@ -32,9 +32,10 @@ class Battery:
     capacity_ah: float
     resistance_ohm: float
     cells: float
-    # Is the resistance, or the state of charge at the start, known exactly?
+    # Is the resistance, the state of charge at the start, or the zero of the current known exactly?
     resistance_exact: bool
     soc_exact: bool
+    current_zero_exact: bool
     # Open-circuit voltage of one cell: state of charge (0 … 1) and V.
     ocv_soc: Array
     ocv_v: Array
@@ -62,6 +63,8 @@ class Series:
     full_scale: float = 0.0
     resolution: float = 0.0
     noise: float = 0.0
+    # Is a method fitted to it, or is it held out?
+    fitted: bool = True
 
     @property
     def step_s(self) -> float:
@@ -83,7 +86,9 @@ def load(folder: pathlib.Path) -> tuple[Series, Series]:
     for effect in model.get("effects", {}):
         if "battery" not in model or "sensor" in model or effect not in KNOWN:
             raise ValueError(f"{path}: effects.{effect}: the methods know {', '.join(KNOWN)} of a battery as part of a design")
-    return tuple(read(folder / name, model) for name in ("recording.csv", "holdout.csv"))
+    recording, holdout = (read(folder / name, model) for name in ("recording.csv", "holdout.csv"))
+    holdout.fitted = False
+    return recording, holdout
 
 
 def read(path: pathlib.Path, model: dict) -> Series:
@@ -150,7 +155,7 @@ def battery_series(path: pathlib.Path, table: pd.DataFrame, segments: list[slice
     if voltage == "v_cell_v":
         battery.cells = 1.0
     t_s = table["t_s"].to_numpy(float)
-    x = filled(table[column])
+    x = filled(table[column]) - float(settings.get("current_zero_a", 0.0))
     reading = table[voltage].to_numpy(float)
     valid = np.isfinite(reading) & table[column].notna().to_numpy()
     soc = count(t_s, x, battery.capacity_ah, float(settings.get("efficiency", 1.0)))
@@ -212,6 +217,7 @@ def read_battery(path: pathlib.Path, settings: dict) -> Battery:
         cells=float(settings.get("cells", 1.0)),
         resistance_exact=float(settings.get("resistance_uncertainty", 0.0)) == 0.0,
         soc_exact="initial_soc" in settings and float(settings.get("initial_soc_uncertainty", 0.0)) == 0.0,
+        current_zero_exact=float(settings.get("current_zero_uncertainty_a", 0.0)) == 0.0,
         ocv_soc=ocv[:, 0],
         ocv_v=ocv[:, 1],
     )

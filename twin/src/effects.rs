@@ -391,8 +391,18 @@ pub trait Effect: Sync {
         false
     }
 
+    /// Two effects at a time that look as it does where they act together: it is not named before they were tried in its place.
+    fn stands_for(&self) -> &'static [[&'static str; 2]] {
+        &[]
+    }
+
     /// Whether it says what the ohmic resistance is: nothing of it is then left open by the model file.
     fn says_resistance(&self) -> bool {
+        false
+    }
+
+    /// Whether it says what the recorded current is off by: nothing of its zero is then left open by the model file.
+    fn says_current_zero(&self) -> bool {
         false
     }
 

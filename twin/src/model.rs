@@ -144,6 +144,10 @@ pub struct Battery {
     pub cells: u32,
     /// Column of the current; `i_ref_a`, else `i_meas_a` if not stated.
     pub current: Option<String>,
+    /// What that column reads without a current, in A.
+    pub current_zero_a: f64,
+    /// Its standard uncertainty.
+    pub current_zero_uncertainty_a: f64,
     /// White noise of a voltage reading, rms, in V, of one cell or the pack as recorded.
     pub noise_v: f64,
     /// Coloured noise of a voltage reading, rms, in V.
@@ -180,6 +184,10 @@ struct BatteryText {
     #[serde(default = "one_cell")]
     cells: u32,
     current: Option<String>,
+    #[serde(default)]
+    current_zero_a: f64,
+    #[serde(default)]
+    current_zero_uncertainty_a: f64,
     #[serde(default)]
     noise_v: f64,
     #[serde(default)]
@@ -494,6 +502,10 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
             ("ohmic_resistance_ohm", text.ohmic_resistance_ohm),
             ("resistance_uncertainty", text.resistance_uncertainty),
             ("initial_soc_uncertainty", text.initial_soc_uncertainty),
+            (
+                "current_zero_uncertainty_a",
+                text.current_zero_uncertainty_a,
+            ),
             ("noise_v", text.noise_v),
             ("noise_coloured_v", text.noise_coloured_v),
             ("noise_coloured_tau_s", text.noise_coloured_tau_s),
@@ -532,6 +544,12 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         text.alignment_s,
         text.alignment_s.is_finite(),
         "a time in s, below 0 if voltages were read after the current",
+    )?;
+    range(
+        "current_zero_a",
+        text.current_zero_a,
+        text.current_zero_a.is_finite(),
+        "what the current's column reads without a current, in A",
     )?;
     if let Some(soc) = text.initial_soc {
         range(
@@ -576,6 +594,8 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         initial_soc_uncertainty: text.initial_soc_uncertainty,
         cells: text.cells,
         current: text.current,
+        current_zero_a: text.current_zero_a,
+        current_zero_uncertainty_a: text.current_zero_uncertainty_a,
         noise_v: text.noise_v,
         noise_coloured_v: text.noise_coloured_v,
         noise_coloured_tau_s: text.noise_coloured_tau_s,

@@ -254,6 +254,10 @@ pub struct BatteryBase {
     pub resistance_ohm: f64,
     /// Relative standard uncertainty of [`BatteryBase::resistance_ohm`]; 0: exact.
     pub resistance_sigma: f64,
+    /// What the recorded current is above the battery's, in A.
+    pub current_zero_a: f64,
+    /// Standard uncertainty of [`BatteryBase::current_zero_a`]; 0: exact.
+    pub current_zero_sigma_a: f64,
     /// Time by which voltages were read before the current of their row, in s.
     pub alignment_s: f64,
 }

@@ -371,7 +371,8 @@ fn an_extended_model_in_another_folder_finds_its_table() {
     fs::write(folder.path().join("ocv.csv"), "soc,ocv_v\n0,3\n1,4\n").unwrap();
     let path = models.join("m.toml");
     let text = "schema = 1\n[battery]\ncapacity_ah = 2\nocv_file = \"../ocv.csv\" # measured\n\
-                ohmic_resistance_ohm = 0.02\ninitial_soc = 0.9\n";
+                ohmic_resistance_ohm = 0.02\ninitial_soc = 0.9\ncurrent_zero_a = 0.002\n\
+                current_zero_uncertainty_a = 0.01\n";
     fs::write(&path, text).unwrap();
     let model = Model::read(&path).unwrap();
     assert_eq!(
@@ -383,17 +384,21 @@ fn an_extended_model_in_another_folder_finds_its_table() {
     let shift = Shift {
         soc: -0.02,
         resistance: 0.5,
+        current_zero_a: -0.012,
         ..Shift::default()
     };
     let extended = model.extended(&[], shift, &models, &out).unwrap();
     assert!(extended.contains("# measured"), "{extended}");
     fs::create_dir_all(&out).unwrap();
     let path = out.join("model.toml");
-    fs::write(&path, extended).unwrap();
+    fs::write(&path, &extended).unwrap();
     let again = Model::read(&path).unwrap().battery.unwrap();
     assert_eq!(again.ocv, [(0.0, 3.0), (1.0, 4.0)]);
     assert!((again.initial_soc.unwrap() - 0.88).abs() < 1e-12);
     assert!((again.resistance_ohm - 0.03).abs() < 1e-12);
+    // The zero of a current is one recording's own: it is said, and stated as before.
+    assert_eq!(again.current_zero_a, 0.002);
+    assert!(extended.contains("a current_zero_a of -0.01"), "{extended}");
     // A cell may begin fuller than the full one of its table, and is read so again.
     let fuller = Shift {
         soc: 0.109,

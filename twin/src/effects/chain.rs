@@ -12,6 +12,8 @@ pub struct Nuisance {
     pub soc_shift: Vec<f64>,
     /// Relative change of the ohmic resistance.
     pub resistance: f64,
+    /// Added to what the recorded current is above the battery's, in A.
+    pub current_zero_a: f64,
     /// What the open-circuit voltage of a cell is above each line of its table, half-way between its points, in V; nothing where there is
     /// no value.
     pub ocv_bend_v: Vec<f64>,
@@ -57,6 +59,8 @@ enum Link<'m> {
     Effect(&'static dyn Effect, &'m [f64], Option<usize>),
     /// The averaging window by design.
     Window,
+    /// The battery's current from what was recorded of it.
+    Zero,
     /// From the drive's rows to the observation's.
     Sample,
     /// What the chain does not model itself.
@@ -78,6 +82,8 @@ pub enum Change {
     SocShift,
     /// [`Nuisance::resistance`].
     Resistance,
+    /// [`Nuisance::current_zero_a`].
+    CurrentZero,
     /// [`Nuisance::ocv_bend_v`].
     OcvBend,
     /// [`Nuisance::alignment_s`].
@@ -88,7 +94,8 @@ pub enum Change {
 fn first(links: &[Link<'_>], change: Change) -> usize {
     let tells = |link: &Link<'_>| match (change, link) {
         (Change::Member(index), Link::Effect(_, _, member)) => *member == Some(index),
-        (Change::SocShift, Link::Count)
+        (Change::CurrentZero, Link::Zero)
+        | (Change::SocShift, Link::Count)
         | (Change::Resistance | Change::OcvBend, Link::Terminals)
         | (Change::Alignment, Link::Sample) => true,
         _ => false,
@@ -274,6 +281,7 @@ impl<'a> Chain<'a> {
                 through(&mut order, Stage::BatteryVoltage);
             }
             Base::Battery(_) => {
+                order.push(Link::Zero);
                 through(&mut order, Stage::BatteryCharge);
                 order.push(Link::Count);
                 through(&mut order, Stage::BatteryHeat);
@@ -308,6 +316,17 @@ impl<'a> Chain<'a> {
                 };
                 scene.delay_s += nuisance.alignment_s + by_design_s;
                 scene.sample(self.problem.view);
+            }
+            Link::Zero => {
+                let by_design_a = scene
+                    .battery
+                    .as_ref()
+                    .map_or(0.0, |it| it.base.current_zero_a);
+                let zero_a = by_design_a + nuisance.current_zero_a;
+                // Without a zero the series stays shared.
+                if zero_a != 0.0 {
+                    scene.signal.iter_mut().for_each(|i| *i -= zero_a);
+                }
             }
             // Without a reading as designed the series stays shared.
             Link::Beside if self.beside.is_empty() => {}

@@ -48,6 +48,10 @@ impl Effect for ParasiticLoad {
         (values[0] < 0.0).then_some("a consumer supplies no current")
     }
 
+    fn says_current_zero(&self) -> bool {
+        true
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         // The cell's whole current: its voltage falls and its charge goes by it.
         scene.signal.iter_mut().for_each(|i| *i += values[0]);

@@ -204,6 +204,9 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
     if model.says_resistance() {
         model.nuisance.resistance = 0.0;
     }
+    if model.says_current_zero() {
+        model.nuisance.current_zero_a = 0.0;
+    }
     let predicted = bench.run(&model);
     let mut here = Point::of(bench, model, predicted);
     let mut sigma = bench.spread(&here.residual);

@@ -16,6 +16,8 @@ pub const BASE_OFF: f64 = 4.0;
 
 /// A small step of a bend, as a share of its uncertainty.
 const SMALL_BEND: f64 = 1e-3;
+/// The same of a current's zero.
+const SMALL_ZERO: f64 = 1e-3;
 
 /// Whether a value of the base stands at that end, by how many of its standard uncertainties it is off.
 pub(super) fn at_base_end(deviations: f64) -> bool {
@@ -30,6 +32,7 @@ pub(super) enum Coordinate {
     /// Index of the start, among those of the bench.
     SocShift(usize),
     Resistance,
+    CurrentZero,
     /// Index of the line, among those of the bench that bend.
     OcvBend(usize),
     Alignment,
@@ -42,6 +45,7 @@ impl Coordinate {
             Self::Value(member, _, _) => Change::Member(member),
             Self::SocShift(_) => Change::SocShift,
             Self::Resistance => Change::Resistance,
+            Self::CurrentZero => Change::CurrentZero,
             Self::OcvBend(_) => Change::OcvBend,
             Self::Alignment => Change::Alignment,
         }
@@ -134,6 +138,7 @@ impl Slope {
             *at = match coordinate {
                 Coordinate::SocShift(start) => bench.starts[*start].at(&model.nuisance),
                 Coordinate::Resistance => model.nuisance.resistance,
+                Coordinate::CurrentZero => model.nuisance.current_zero_a,
                 Coordinate::OcvBend(bend) => bend_at(bench, *bend, &model.nuisance),
                 _ => *at,
             };
@@ -182,6 +187,15 @@ fn resistance_sigma(bench: &Workbench<'_>) -> Option<f64> {
     }
 }
 
+/// Standard uncertainty of the recorded current's zero, in A, if the model leaves it open.
+pub(super) fn current_zero_sigma_a(bench: &Workbench<'_>, model: &Model) -> Option<f64> {
+    match &bench.problem.base {
+        Base::Battery(base) => Some(base.current_zero_sigma_a)
+            .filter(|sigma_a| *sigma_a > 0.0 && !model.says_current_zero()),
+        Base::Sensor(_) => None,
+    }
+}
+
 /// Whether a value of the base stands where its uncertainty ends, and the residual would have it beyond: it is free no more, and
 /// hides nothing that an effect explains.
 fn ended(column: &[f64], prior: f64, at: f64, residual: &[f64]) -> bool {
@@ -210,6 +224,11 @@ fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta
             let most = resistance_sigma(bench).map_or(5.0, |sigma| BASE_OFF * sigma);
             let resistance = model.nuisance.resistance + delta;
             model.nuisance.resistance = resistance.clamp((-most).max(-0.9), most);
+        }
+        Coordinate::CurrentZero => {
+            let most_a = current_zero_sigma_a(bench, model).map_or(0.0, |it| BASE_OFF * it);
+            let zero_a = model.nuisance.current_zero_a + delta;
+            model.nuisance.current_zero_a = zero_a.clamp(-most_a, most_a);
         }
         Coordinate::OcvBend(bend) => {
             let (line, sigma_v) = bench.bends[bend];
@@ -291,6 +310,14 @@ pub(super) fn coordinates(
                 1e-4,
                 inverse(base.resistance_sigma),
                 model.nuisance.resistance,
+            ));
+        }
+        if let Some(sigma_a) = current_zero_sigma_a(bench, model) {
+            all.push((
+                Coordinate::CurrentZero,
+                SMALL_ZERO * sigma_a,
+                inverse(sigma_a),
+                model.nuisance.current_zero_a,
             ));
         }
         for (index, (_, sigma_v)) in bench.bends.iter().enumerate() {

@@ -1,10 +1,11 @@
-//! How uncertain it is at which state of charge each operation begins: what is fitted beside every model, and in every file.
+//! What is each recording's own: at which state of charge each operation begins, and the zero of the current. It is fitted beside every
+//! model, and in every file.
 
 use std::ops::Range;
 
 use super::normal::dot;
 use super::robust::{huber, spread, weights};
-use super::slope::BASE_OFF;
+use super::slope::{BASE_OFF, current_zero_sigma_a};
 use super::workbench::{Model, Workbench};
 use crate::effects::chain::Nuisance;
 use crate::problem::{Base, Problem};
@@ -16,6 +17,10 @@ const MOST: usize = 24;
 const HALF: f64 = 0.5;
 /// Steps in which the starts of a file are found that is not fitted otherwise: the open-circuit voltage bends.
 const STEPS: usize = 4;
+/// The same of the zero of its current.
+const ZERO_STEPS: usize = 3;
+/// A step is the last one if the loss falls by less than this share.
+const GAINED: f64 = 1e-4;
 /// A small step of a state of charge.
 pub(super) const SMALL: f64 = 1e-5;
 
@@ -128,8 +133,56 @@ pub(super) fn within_block(block: f64, all: f64) -> bool {
     block > (1.0 - HALF) * all
 }
 
-/// A model with the starts that fit a bench best, each within its uncertainty, everything else as it is; and what it leaves.
+/// A model as it is taken to a recording that it was not fitted to: where each operation starts, and the zero of the recorded current, are
+/// that recording's own, those that fit it best, each within its uncertainty; everything else is as it is. And what it leaves.
 pub(super) fn begun(bench: &Workbench<'_>, model: Model) -> (Model, Vec<f64>) {
+    let with_zero = |model: &Model, zero_a: f64| {
+        let mut model = model.clone();
+        model.nuisance.current_zero_a = zero_a;
+        with_starts(bench, model)
+    };
+    let mut here = with_zero(&model, 0.0);
+    let Some(sigma_a) = current_zero_sigma_a(bench, &model) else {
+        return here;
+    };
+    for _ in 0..ZERO_STEPS {
+        let zero_a = here.0.nuisance.current_zero_a;
+        // The starts follow: what the zero changes beside them.
+        let by = if zero_a > 0.0 { -sigma_a } else { sigma_a };
+        let moved = with_zero(&here.0, zero_a + by);
+        let sigma = spread(&here.1);
+        let weight = weights(&here.1, sigma);
+        let change = super::slope::change(&here.1, &moved.1);
+        let weighted: Vec<f64> = change
+            .iter()
+            .zip(&weight)
+            .map(|(c, w)| c / by * w)
+            .collect();
+        let prior = sigma_a.powi(-2);
+        let step =
+            (dot(&weighted, &here.1) - prior * zero_a) / (dot(&weighted, &change) / by + prior);
+        let most_a = BASE_OFF * sigma_a;
+        let tried = with_zero(&here.0, (zero_a + step).clamp(-most_a, most_a));
+        let cost = |(model, residual): &(Model, Vec<f64>)| {
+            let starts = bench.starts.iter();
+            let off = starts.map(|start| start.at(&model.nuisance) / start.sigma);
+            let off = off.chain([model.nuisance.current_zero_a / sigma_a]);
+            residual.iter().map(|r| huber(r / sigma)).sum::<f64>()
+                + 0.5 * off.map(|off| off * off).sum::<f64>()
+        };
+        let (from, to) = (cost(&here), cost(&tried));
+        if to < from {
+            here = tried;
+        }
+        if from - to <= GAINED * from {
+            break;
+        }
+    }
+    here
+}
+
+/// A model with the starts that fit a bench best, everything else as it is; and what it leaves.
+fn with_starts(bench: &Workbench<'_>, model: Model) -> (Model, Vec<f64>) {
     let starts = &bench.starts;
     let mut here = Model {
         nuisance: Nuisance {
@@ -186,7 +239,7 @@ pub(super) fn begun(bench: &Workbench<'_>, model: Model) -> (Model, Vec<f64>) {
                 cost(start, &tried, &there.nuisance),
             );
             if to < from {
-                gained |= from - to > 1e-4 * from;
+                gained |= from - to > GAINED * from;
                 let by = start.at(&there.nuisance) - start.at(&here.nuisance);
                 start.shift(&mut here.nuisance, by);
             }

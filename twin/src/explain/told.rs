@@ -19,6 +19,8 @@ use crate::spectrum;
 const TOLD_PERCENT: f64 = 0.1;
 /// Least bend of the open-circuit voltage that is told, in V.
 const TOLD_V: f64 = 0.001;
+/// A zero of the recorded current is told from this share of its uncertainty on.
+const TOLD_ZERO: f64 = 0.1;
 /// An alignment of readings is told from this share of a step on.
 const TOLD_STEP: f64 = 0.05;
 /// What the model file leaves open is in the verdict's sentence if it makes the error smaller by this factor.
@@ -307,6 +309,7 @@ fn at_limit(nuisance: &Nuisance, base: &Base) -> bool {
     let mut bends = nuisance.ocv_bend_v.iter().enumerate();
     starts.any(|(shift, sigma)| ends(*shift, *sigma))
         || ends(nuisance.resistance, base.resistance_sigma)
+        || ends(nuisance.current_zero_a, base.current_zero_sigma_a)
         || bends.any(|(line, found_v)| ends(base.cells * found_v, bend_v(&base.ocv, line)))
 }
 
@@ -315,7 +318,7 @@ pub(super) fn start_of(operation: usize) -> String {
     format!("at the start of operation {}", operation + 1)
 }
 
-/// By what the battery as designed differs, if by more than [`TOLD_PERCENT`].
+/// By what the battery as designed differs, if by as much as is told.
 fn base_differs(nuisance: &Nuisance, base: &Base) -> Option<String> {
     let Base::Battery(base) = base else {
         return None;
@@ -349,9 +352,19 @@ fn base_differs(nuisance: &Nuisance, base: &Base) -> Option<String> {
                 if bend_v > 0.0 { "higher" } else { "lower" }
             )
         });
+    let zero_a = nuisance.current_zero_a;
+    let zero =
+        (zero_a.abs() >= TOLD_ZERO * base.current_zero_sigma_a && zero_a != 0.0).then(|| {
+            let way = if zero_a > 0.0 { "higher" } else { "lower" };
+            format!(
+                "the recorded current's zero {} A {way}",
+                short(zero_a.abs())
+            )
+        });
     let found: Vec<String> = [
         by(nuisance.resistance, "the ohmic resistance", "%"),
         by(shift, &start, "points of per cent"),
+        zero,
         bend,
     ]
     .into_iter()

@@ -89,6 +89,13 @@ impl Model {
             .any(|member| member.effect.says_resistance())
     }
 
+    /// Whether one of its effects says what the recorded current is off by.
+    pub fn says_current_zero(&self) -> bool {
+        self.members
+            .iter()
+            .any(|member| member.effect.says_current_zero())
+    }
+
     /// With one more effect.
     pub fn with(&self, member: Member) -> Self {
         let mut model = self.clone();
@@ -208,7 +215,11 @@ fn key(model: &Model) -> Key {
                 // Where the starts end, of which there may be any number.
                 &[f64::NAN],
                 nuisance.ocv_bend_v.as_slice(),
-                &[nuisance.resistance, nuisance.alignment_s],
+                &[
+                    nuisance.resistance,
+                    nuisance.current_zero_a,
+                    nuisance.alignment_s,
+                ],
             ]
             .concat(),
         ),

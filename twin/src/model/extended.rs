@@ -31,6 +31,8 @@ pub struct Shift {
     pub soc: f64,
     /// Relative change of the ohmic resistance.
     pub resistance: f64,
+    /// Added to what the recorded current is above the battery's, in A.
+    pub current_zero_a: f64,
     /// What the open-circuit voltage of a cell is above each line of its table, half-way between its points, in V.
     pub ocv_bend_v: Vec<f64>,
     /// Time by which a sensor's readings stand for an earlier moment than their row, in s.
@@ -54,6 +56,7 @@ impl Shift {
         for (mine, found) in [
             (&mut self.soc, soc_shift),
             (&mut self.resistance, nuisance.resistance),
+            (&mut self.current_zero_a, nuisance.current_zero_a),
             (alignment_s, nuisance.alignment_s),
         ] {
             if *mine == 0.0 {
@@ -166,6 +169,15 @@ impl Extension<'_> {
             let resistance = battery.resistance_ohm * (1.0 + self.shift.resistance);
             set(table, "ohmic_resistance_ohm", value(resistance));
             was(table, "ohmic_resistance_ohm", battery.resistance_ohm);
+        }
+        // Another recording has a zero of its own: one of this recording would be wrong there.
+        if self.shift.current_zero_a != 0.0 {
+            let found_a = battery.current_zero_a + self.shift.current_zero_a;
+            said(
+                table,
+                "current_zero_uncertainty_a",
+                &format!("In its own recording twin explain found a current_zero_a of {found_a}."),
+            );
         }
         if !self.shift.ocv_bend_v.is_empty() {
             let mut points: Array = bent(&battery.ocv, &self.shift.ocv_bend_v)

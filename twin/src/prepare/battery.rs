@@ -109,6 +109,8 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             cells,
             resistance_ohm: battery.resistance_ohm * cells,
             resistance_sigma: battery.resistance_uncertainty,
+            current_zero_a: battery.current_zero_a,
+            current_zero_sigma_a: battery.current_zero_uncertainty_a,
             alignment_s: match view {
                 View::Voltage => battery.alignment_s,
                 _ => 0.0,

@@ -29,12 +29,15 @@ pub struct Cell {
     pub resistance_ohm: f64,
     /// A branch of 60 s, in Ω.
     pub slow_ohm: f64,
+    /// What the recorded current is above the cell's, in A.
+    pub current_zero_a: f64,
 }
 
 pub const AS_DESIGNED: Cell = Cell {
     capacity_ah: DESIGN_AH,
     resistance_ohm: DESIGN_OHM,
     slow_ohm: 0.0,
+    current_zero_a: 0.0,
 };
 
 /// Rows of one operation from a state of charge on, the first reading off by so much.
@@ -52,8 +55,9 @@ pub fn operation(cell: Cell, soc: f64, first_v: f64, cycle: usize, seed: u64) ->
             let volts =
                 open_circuit_v(soc) - cell.resistance_ohm * current_a - cell.slow_ohm * slow_a;
             text.push_str(&format!(
-                "{},{cycle},{current_a:.5},{:.5}\n",
+                "{},{cycle},{:.5},{:.5}\n",
                 k / FINE,
+                current_a + cell.current_zero_a,
                 volts + error_v
             ));
         }
