@@ -881,6 +881,34 @@ fn few_edges_name_no_one_alone() {
     }
 }
 
+/// What is late all the time, and ever later, is no window that is read at another place of its period each time.
+#[test]
+fn a_delay_beside_a_clock_of_another_rate_is_no_window() {
+    // Few enough rows that a window among thousands comes near.
+    const SHORT: usize = 4000;
+    let mut truth = truth();
+    truth.t_s.truncate(SHORT);
+    for series in [
+        &mut truth.current_a,
+        &mut truth.temperature_c,
+        &mut truth.high,
+    ] {
+        series.truncate(SHORT);
+    }
+    for (seed, skew) in [(71, 45e-6), (72, 45e-6), (73, 30e-6), (74, -45e-6)] {
+        let reading = (0..SHORT).map(|row| {
+            let late_rows = (0.012 + skew * truth.t_s[row]) / STEP_S;
+            let at = (row as f64 - late_rows).clamp(0.0, (SHORT - 1) as f64);
+            let [before, after] = [0, 1].map(|k| truth.current_a[(at as usize + k).min(SHORT - 1)]);
+            before + (after - before) * at.fract()
+        });
+        let report = explained(&truth, reading.collect(), seed, &[]);
+        let named: Vec<&str> = report.effects.iter().map(|it| it.id.as_str()).collect();
+        assert_eq!(named.len(), 2, "{seed}: {named:?}");
+        assert!(named.contains(&"clock-skew"), "{seed}: {named:?}");
+    }
+}
+
 /// Readings that stay, though the design says that each is new, are measured and held: no mean alone.
 #[test]
 fn a_window_that_is_held_is_named_as_such() {

@@ -51,6 +51,11 @@ impl Effect for SampledWindow {
         }
     }
 
+    fn stands_for(&self) -> &'static [[&'static str; 2]] {
+        // A reading that grows older from one to the next, beside what is late all the time, is a window's that is read ever later.
+        &[["clock-skew", "delay"], ["clock-skew", "lag"]]
+    }
+
     fn starts(&self, scale: &Scale, clues: &Clues<'_>) -> Vec<Vec<f64>> {
         let lowest = 2.5 * scale.step_s;
         let (_, highest) = self.bounds(0, scale);

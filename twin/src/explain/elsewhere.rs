@@ -7,6 +7,7 @@ use super::select::{self, Selection, percent};
 use super::slope::BASE_OFF;
 use super::told::start_of;
 use super::workbench::{Model, Workbench};
+use crate::model::BEYOND_SOC;
 use crate::problem::{Base, Problem};
 
 /// Standard uncertainty with which a start may be anywhere from empty to full.
@@ -40,7 +41,7 @@ pub(super) fn elsewhere(bench: &Workbench<'_>, selection: &Selection) -> Option<
         .unwrap_or_default();
     let stated = begin_of(bench.problem, operation)?;
     let there = stated + shift;
-    if shift.abs() <= BASE_OFF * sigma || !(0.0..=1.0).contains(&there) {
+    if shift.abs() <= BASE_OFF * sigma || !(-BEYOND_SOC..=1.0 + BEYOND_SOC).contains(&there) {
         return None;
     }
     let condition = format!(

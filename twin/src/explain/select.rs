@@ -22,7 +22,7 @@ use crate::effects::find;
 use grow::addition;
 use losses::share;
 use obstacle::{FLOOR, obstacle};
-use rivals::{name, plainer, swap, swapped};
+use rivals::{name, new, plainer, swap, swapped};
 
 /// Effects in one model at most.
 const MOST_EFFECTS: usize = 6;
@@ -40,7 +40,7 @@ pub struct Named {
     pub index: usize,
     /// Share of the held-out loss that goes when it is added last.
     pub held_out_gain: f64,
-    /// 99th percentile of placebos for the same step.
+    /// 99th percentile of placebos for the same step, or with the other effects there if it is kept by that.
     pub placebo_p99: f64,
     /// What tells it if its place does (`strays`).
     pub by_place: Option<String>,
@@ -162,7 +162,7 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
 struct Search<'b, 'a> {
     bench: &'b Workbench<'a>,
     seed: u64,
-    /// 99th percentile of placebos at the step at which an effect was added, by its id.
+    /// 99th percentile of placebos at the step at which an effect was added, or with the others there, by its id.
     placebo_p99: Vec<(&'static str, f64)>,
     /// Forms that are not tried again.
     barred: Vec<(&'static str, usize)>,
@@ -262,9 +262,9 @@ impl Search<'_, '_> {
     /// What takes the place of the effect at an index has to beat the same placebos.
     fn inherit(&mut self, before: &Fit, index: usize, after: &Fit) {
         let p99 = p99_of(&self.placebo_p99, before.model.members[index].id());
-        if let Some(last) = after.model.members.last() {
-            self.placebo_p99.retain(|(known, _)| *known != last.id());
-            self.placebo_p99.push((last.id(), p99));
+        for id in &after.model.ids()[new(before, after)..] {
+            self.placebo_p99.retain(|(known, _)| known != id);
+            self.placebo_p99.push((id, p99));
         }
     }
 
@@ -287,13 +287,19 @@ impl Search<'_, '_> {
                 .collect();
             tried.sort_by(|a, b| a.2.total_cmp(&b.2));
             tried.truncate(looked_at);
+            // Limits that were asked anew, and passed.
+            let mut anew: Vec<(&'static str, f64)> = Vec::new();
             let needless = tried.into_iter().find_map(|(index, without, missed)| {
-                let mut placebos = p99_of(&self.placebo_p99, here.model.members[index].id());
+                let id = here.model.members[index].id();
+                let mut placebos = p99_of(&self.placebo_p99, id);
                 if missed <= placebos && missed > FLOOR {
                     // That limit is of the step at which it was added, when the others were not there: what placebos took then was
                     // mostly what the others take now.
                     let with_them = screen(bench, &without, self.seed, DRAWS).placebo_p99;
                     placebos = placebos.min(with_them);
+                    if missed > placebos {
+                        anew.push((id, placebos));
+                    }
                 }
                 let why = if missed <= placebos {
                     format!(
@@ -306,6 +312,14 @@ impl Search<'_, '_> {
                 };
                 Some((index, without, why))
             });
+            for (id, p99) in anew {
+                self.decisions.push(format!(
+                    "{id} kept, with the others there: placebos take {} beside them.",
+                    percent(p99)
+                ));
+                self.placebo_p99.retain(|(known, _)| *known != id);
+                self.placebo_p99.push((id, p99));
+            }
             let Some((index, without, why)) = needless else {
                 return leaner;
             };

@@ -64,25 +64,13 @@ fn rivals(
     }
     // Where few rows show the effect (an edge or two), the gain of a start says little of what its fit will be worth: of what looks
     // like it, the starts that come nearest to the readings as they are, too.
-    let as_read = bench.as_read(&without.predicted);
-    let clues = bench.clues(&as_read);
     for effect in bench.library.iter().copied().filter(alike) {
         if !joins(model, effect) {
             continue;
         }
-        let mut starts: Vec<(f64, Member)> = effect
-            .starts(&bench.scale, &clues)
-            .into_par_iter()
-            .map(|values| {
-                let member = Member { effect, values };
-                let there = bench.run(&added(&without.model, member.clone()));
-                (loss(&bench.residual(&there), without.sigma), member)
-            })
-            .collect();
-        starts.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let nearest = starts.into_iter().take(STARTS).map(|(_, member)| member);
         members.extend(
-            nearest
+            nearest(bench, without, effect)
+                .into_iter()
                 .filter(|member| {
                     members.iter().all(|known| {
                         known.effect.card().id != member.effect.card().id
@@ -95,6 +83,43 @@ fn rivals(
     members
 }
 
+/// The starts of an effect that come nearest to the readings, beside the effects of a fit.
+fn nearest(bench: &Workbench<'_>, beside: &Fit, effect: &'static dyn Effect) -> Vec<Member> {
+    let as_read = bench.as_read(&beside.predicted);
+    let mut starts: Vec<(f64, Member)> = effect
+        .starts(&bench.scale, &bench.clues(&as_read))
+        .into_par_iter()
+        .map(|values| {
+            let member = Member { effect, values };
+            let there = bench.run(&added(&beside.model, member.clone()));
+            (loss(&bench.residual(&there), beside.sigma), member)
+        })
+        .collect();
+    starts.sort_by(|a, b| a.0.total_cmp(&b.0));
+    starts
+        .into_iter()
+        .take(STARTS)
+        .map(|(_, member)| member)
+        .collect()
+}
+
+/// Models with two effects in the place of one that may stand for them; `without` has none of the three.
+fn of_two(bench: &Workbench<'_>, without: &Fit, one: &'static dyn Effect) -> Vec<Model> {
+    let begun = |beside: &Fit, id: &str| -> Option<Model> {
+        let mut library = bench.library.iter().copied();
+        let effect = library.find(|effect| effect.card().id == id && !beside.model.has(id))?;
+        let start = nearest(bench, beside, effect).into_iter().next()?;
+        Some(beside.model.with(start))
+    };
+    let pairs = one.stands_for().iter();
+    pairs
+        .filter_map(|[first, second]| {
+            let first = fit(bench, &begun(without, first)?, None);
+            begun(&first, second)
+        })
+        .collect()
+}
+
 /// Whether an effect can stand beside those of a model: it is not there, or it has more branches than what is there and takes that
 /// one's place as well.
 pub fn joins(model: &Model, effect: &'static dyn Effect) -> bool {
@@ -103,7 +128,7 @@ pub fn joins(model: &Model, effect: &'static dyn Effect) -> bool {
     same.is_none_or(|member| card.parameters.len() > member.values.len())
 }
 
-/// Fits every rival in the place of every effect.
+/// Fits every rival in the place of every effect, and what it may stand for.
 pub(super) fn swapped(bench: &Workbench<'_>, now: &Fit) -> Vec<(usize, Fit)> {
     let (places, models): (Vec<usize>, Vec<Model>) = (0..now.model.members.len())
         .flat_map(|index| {
@@ -113,6 +138,7 @@ pub(super) fn swapped(bench: &Workbench<'_>, now: &Fit) -> Vec<(usize, Fit)> {
             rivals(bench, &without, &now.model, (id, taken))
                 .into_iter()
                 .map(|rival| added(&without.model, rival))
+                .chain(of_two(bench, &without, now.model.members[index].effect))
                 // An alignment that is free can take over what a rival explains, and leave it nothing to be named for.
                 .flat_map(|model| {
                     let unaligned = bench.aligns(&model).then(|| Model {
@@ -160,10 +186,16 @@ pub(super) fn swap(
     decisions.push(format!(
         "{} replaced by {}: the held-out error is lower by {}.",
         now.model.members[index].id(),
-        best.model.members[last].id(),
+        best.model.ids()[new(now, best)..].join(" and "),
         percent((here - loss) / here)
     ));
     Some((index, best.clone()))
+}
+
+/// The first of the effects that a model has in the place of one of another.
+pub(super) fn new(before: &Fit, after: &Fit) -> usize {
+    let kept = before.model.members.len() - 1;
+    kept.min(after.model.members.len() - 1)
 }
 
 /// The model with an effect, at the index that comes with it, replaced by one of its equals whose equation is exact (a constant, a
@@ -219,6 +251,8 @@ pub(super) fn name(
             let mut equivalent: Vec<&'static str> = others
                 .iter()
                 .filter(|(at, _)| *at == index)
+                // Two for one are no equal of it.
+                .filter(|(_, other)| other.model.members.len() <= now.model.members.len())
                 .filter(|(_, other)| {
                     let last = other.model.members.len() - 1;
                     share(bench, &without, other) >= least
