@@ -121,7 +121,7 @@ fn problem(rows: usize, view: View, effects: &[(&str, &[f64])]) -> Problem {
                 cells: 1.0,
                 resistance_ohm: 0.001,
                 resistance_sigma: 0.1,
-                alignment_s: 0.0,
+                ..BatteryBase::default()
             })
         } else {
             Base::Sensor(SensorBase {

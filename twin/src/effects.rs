@@ -401,6 +401,11 @@ pub trait Effect: Sync {
         false
     }
 
+    /// Whether it says how resistances follow temperature: they do not do so as is usual then.
+    fn says_temperature(&self) -> bool {
+        false
+    }
+
     /// Whether it says what the recorded current is off by: nothing of its zero is then left open by the model file.
     fn says_current_zero(&self) -> bool {
         false

@@ -1,7 +1,7 @@
 //! From problems to named effects: fit, select, say where, how sure and what is left.
 //!
 //! One way: `course` asks how the reference goes from row to row, [`workbench`] makes a problem ready (`apart`: whether a tester read
-//! voltages at another moment than currents; `censored`: what readings tell behind a threshold, steps or rails of the model file), [`screen`] asks which effects could account for what is left, [`fit`] fits
+//! voltages at another moment than currents; `beyond`: what is taken of resistances where a file is colder or warmer; `censored`: what readings tell behind a threshold, steps or rails of the model file), [`screen`] asks which effects could account for what is left, [`fit`] fits
 //! them, with [`slope`]s, [`normal`] equations and a [`robust`] loss, and with what the model file leaves open (`starts`);
 //! [`held_out`] says what a fit is worth on rows that it was not made of, and [`select`] decides. [`intervals`] and [`locate`] say how
 //! sure and where; `trust`, [`shape`] and `unfitted` take back names that the recording or other files do not bear out, `strays`
@@ -10,6 +10,7 @@
 //! Nothing here knows a file or an effect by name.
 
 mod apart;
+mod beyond;
 mod censored;
 mod course;
 mod elsewhere;
@@ -44,6 +45,8 @@ use crate::effects::chain::{Chain, Nuisance};
 use crate::effects::{Effect, find_with};
 use crate::problem::Problem;
 use crate::report::data::{Report, SignalReport, Unexplained, Verdict};
+pub use beyond::beyond_known;
+use beyond::found_at_c;
 use course::{Answer, Course};
 use fit::Fit;
 use flexible::{Explainable, Features};
@@ -295,6 +298,9 @@ fn tell(
         .remarks
         .extend(times_found(&read, &selection.fit, between));
     report.remarks.extend(behind_ends(&read));
+    report
+        .remarks
+        .extend(others.iter().filter_map(|other| other.beyond(model)));
     let off = current_off(bench, &selection).into_iter();
     report
         .remarks
@@ -383,6 +389,7 @@ fn decide(
     progress: &mut dyn FnMut(f64, &str),
 ) -> Decided {
     let mut selection = select::select(bench, seed, progress);
+    selection.fit.model.nuisance.resistances_at_c = found_at_c(bench, &selection.fit);
     progress(0.95, "looking at what is left");
     let features = Features::new(bench);
     let before = features.explain(&selection.plain.residual, seed);

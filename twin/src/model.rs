@@ -19,7 +19,7 @@ pub use extended::{Found, Shift};
 use place::Places;
 
 use crate::{
-    effects::{self, Parameter},
+    effects::{self, Parameter, scene::ZERO_CELSIUS_K},
     failure::Failure,
 };
 
@@ -130,6 +130,8 @@ pub struct Battery {
     pub resistance_ohm: f64,
     /// Its relative standard uncertainty.
     pub resistance_uncertainty: f64,
+    /// Lowest and highest temperature, in °C, at which the resistances are known; `twin explain` writes it.
+    pub resistances_at_c: Option<[f64; 2]>,
     /// Time by which voltages were read before the current of their row, in s; `twin explain` finds it.
     pub alignment_s: f64,
     /// Open-circuit voltage of one cell: state of charge (ascending) and V; empty if not stated.
@@ -173,6 +175,7 @@ struct BatteryText {
     ohmic_resistance_ohm: f64,
     #[serde(default)]
     resistance_uncertainty: f64,
+    resistances_at_c: Option<[f64; 2]>,
     #[serde(default)]
     alignment_s: f64,
     #[serde(default)]
@@ -545,6 +548,16 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         text.alignment_s.is_finite(),
         "a time in s, below 0 if voltages were read after the current",
     )?;
+    if let Some(at_c) = text.resistances_at_c {
+        let [low, high] = at_c;
+        if !(-ZERO_CELSIUS_K < low && low <= high && high.is_finite()) {
+            return Err(places.fault(
+                &["battery", "resistances_at_c"],
+                &format!("[{}, {}]", number(low), number(high)),
+                "the lowest and the highest temperature in °C at which the resistances are known",
+            ));
+        }
+    }
     range(
         "current_zero_a",
         text.current_zero_a,
@@ -587,6 +600,7 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         efficiency,
         resistance_ohm: text.ohmic_resistance_ohm,
         resistance_uncertainty: text.resistance_uncertainty,
+        resistances_at_c: text.resistances_at_c,
         alignment_s: text.alignment_s,
         ocv,
         ocv_file,

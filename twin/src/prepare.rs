@@ -201,6 +201,11 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
     {
         work.remark(remark);
     }
+    if let Some(remark) =
+        of_view(View::Voltage).and_then(|item| battery::beyond_known(&item.problem))
+    {
+        work.remark(remark);
+    }
     if let Some(remark) = supply_without_range(&items) {
         work.remark(remark);
     }

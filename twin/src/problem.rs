@@ -254,6 +254,8 @@ pub struct BatteryBase {
     pub resistance_ohm: f64,
     /// Relative standard uncertainty of [`BatteryBase::resistance_ohm`]; 0: exact.
     pub resistance_sigma: f64,
+    /// Lowest and highest temperature, in °C, at which the resistances are known; beyond them they follow it as is usual.
+    pub resistances_at_c: Option<[f64; 2]>,
     /// What the recorded current is above the battery's, in A.
     pub current_zero_a: f64,
     /// Standard uncertainty of [`BatteryBase::current_zero_a`]; 0: exact.
@@ -424,6 +426,20 @@ impl Drive {
     /// Number of rows.
     pub fn len(&self) -> usize {
         self.t_s.len()
+    }
+
+    /// What was recorded of the battery's temperature, in °C: the cell's, else its surroundings'.
+    pub fn battery_temperature(&self) -> Option<&Series> {
+        self.cell_temperature_c.as_ref().or(self.ambient_c.as_ref())
+    }
+
+    /// The lowest and the highest of it.
+    pub fn battery_temperatures(&self) -> Option<[f64; 2]> {
+        let known = self.battery_temperature()?.iter().filter(|t| t.is_finite());
+        known.fold(None, |range, &t| {
+            let [low, high] = range.unwrap_or([t, t]);
+            Some([f64::min(low, t), f64::max(high, t)])
+        })
     }
 
     /// True without rows.

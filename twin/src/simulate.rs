@@ -3,8 +3,8 @@
 pub mod board;
 pub mod command;
 
-use crate::effects::scene::mean_flow;
-use crate::problem::{Base, BatteryBase, Drive, Observed, Problem, SensorBase, View};
+use crate::explain;
+use crate::problem::{Base, Drive, Observed, Problem, SensorBase, View};
 
 /// What the simulation as designed says at each observed row, without any effect; NaN where the drive does not reach.
 pub fn designed(problem: &Problem) -> Vec<f64> {
@@ -13,7 +13,7 @@ pub fn designed(problem: &Problem) -> Vec<f64> {
             base.reading.clone()
         }
         Base::Sensor(base) => sensor(base, &problem.drive, &problem.observed, problem.view),
-        Base::Battery(base) => battery(base, &problem.drive, &problem.observed, problem.view),
+        Base::Battery(_) => explain::predict(problem, &[]),
     }
 }
 
@@ -44,43 +44,6 @@ fn sensor(base: &SensorBase, drive: &Drive, observed: &Observed, view: View) -> 
             }
         })
         .collect()
-}
-
-/// Open-circuit voltage at the counted state of charge, less the ohmic drop; or the state of charge in %.
-fn battery(base: &BatteryBase, drive: &Drive, observed: &Observed, view: View) -> Vec<f64> {
-    let mut simulated = vec![f64::NAN; drive.len()];
-    for (index, rows) in drive.segments.iter().enumerate() {
-        let mut soc = base.initial_soc.get(index).copied().unwrap_or(1.0);
-        for row in rows.clone() {
-            if row > rows.start {
-                let h = drive.t_s[row] - drive.t_s[row - 1];
-                let (from, to) = (drive.reference[row - 1], drive.reference[row]);
-                soc -= mean_flow(from, to, base.efficiency) * h / (3600.0 * base.capacity_ah);
-            }
-            simulated[row] = match view {
-                View::StateOfCharge => 100.0 * soc,
-                _ => open_circuit_v(&base.ocv, soc) - base.resistance_ohm * drive.reference[row],
-            };
-        }
-    }
-    if observed.on_drive_rows() {
-        return simulated;
-    }
-    let area = Area::new(drive, &simulated, false);
-    (0..observed.t_s.len())
-        .map(|row| area.value(observed.segment_of(row), observed.t_s[row]))
-        .collect()
-}
-
-/// Straight lines between the points and beyond the ends.
-fn open_circuit_v(table: &[(f64, f64)], soc: f64) -> f64 {
-    let after = table.partition_point(|(known, _)| *known <= soc);
-    let from = after.saturating_sub(1).min(table.len().saturating_sub(2));
-    match (table.get(from), table.get(from + 1)) {
-        (Some(from), Some(to)) => from.1 + (to.1 - from.1) * (soc - from.0) / (to.0 - from.0),
-        (Some(only), None) => only.1,
-        _ => f64::NAN,
-    }
 }
 
 /// A series on drive rows with its integral over time.

@@ -87,7 +87,7 @@ fn the_models_of_this_project_are_read() {
 
 #[test]
 fn faults_name_line_key_and_what_was_expected() {
-    let cases: [(&str, &[&str]); 33] = [
+    let cases: [(&str, &[&str]); 37] = [
         (
             "schema = 1\n[sensor]\nstepp = 1\n",
             &["line 3", "stepp", "`step`", "`noise_coloured`"],
@@ -134,6 +134,32 @@ fn faults_name_line_key_and_what_was_expected() {
         (
             "schema = 1\n[battery]\ncapacity_ah = 0\n",
             &["line 3", "battery.capacity_ah", "above 0"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\nresistances_at_c = [30, 20]\n",
+            &[
+                "line 4",
+                "battery.resistances_at_c",
+                "[30, 20]",
+                "lowest and the highest",
+            ],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\nresistances_at_c = [-300, 20]\n",
+            &["line 4", "battery.resistances_at_c", "[-300, 20]", "°C"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\ncurrent_zero_uncertainty_a = -0.01\n",
+            &[
+                "line 4",
+                "battery.current_zero_uncertainty_a",
+                "-0.01",
+                "zero or more",
+            ],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\ncurrent_zero_a = nan\n",
+            &["line 4", "battery.current_zero_a", "without a current"],
         ),
         (
             "schema = 1\n[battery]\ncapacity_ah = 2\ninitial_soc = 95\n",

@@ -1,11 +1,8 @@
 //! The cell warms itself.
 
-use super::scene::{Scale, Scene, arrhenius};
+use super::scene::{Scale, Scene, USUAL_B_K, arrhenius};
 use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced};
 use crate::problem::{Problem, View};
-
-/// Arrhenius temperature of the resistance where nothing says what it is: that of usual lithium-ion cells, 1500 … 4000 K.
-const USUAL_B_K: f64 = 2000.0;
 
 /// See [`CARD`].
 #[derive(Debug)]

@@ -14,6 +14,8 @@ pub struct Nuisance {
     pub resistance: f64,
     /// Added to what the recorded current is above the battery's, in A.
     pub current_zero_a: f64,
+    /// Lowest and highest temperature, in °C, at which the resistances were found, where the model file states none.
+    pub resistances_at_c: Option<[f64; 2]>,
     /// What the open-circuit voltage of a cell is above each line of its table, half-way between its points, in V; nothing where there is
     /// no value.
     pub ocv_bend_v: Vec<f64>,
@@ -346,7 +348,8 @@ impl<'a> Chain<'a> {
             }
             Link::Warm => {
                 if let Some(battery) = &mut scene.battery {
-                    battery.warm();
+                    let known_at_c = battery.base.resistances_at_c;
+                    battery.warm(known_at_c.or(nuisance.resistances_at_c), scene.drive);
                 }
             }
             Link::Terminals => {

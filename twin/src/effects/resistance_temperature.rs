@@ -39,6 +39,10 @@ impl Effect for ResistanceTemperature {
         vec![vec![300.0], vec![2000.0], vec![5000.0]]
     }
 
+    fn says_temperature(&self) -> bool {
+        true
+    }
+
     /// Over the tens of kelvin of a recording the law holds within a percent.
     fn idealised(&self) -> f64 {
         0.01

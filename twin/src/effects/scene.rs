@@ -15,6 +15,10 @@ pub const REFERENCE_C: f64 = 25.0;
 /// 0 °C in K.
 pub const ZERO_CELSIUS_K: f64 = 273.15;
 
+/// Arrhenius temperature of the resistances where nothing says what it is, in K: that of usual lithium-ion cells is 1500 … 4000 K (17 kJ/mol
+/// of an electrolyte's conductivity are 2000 K).
+pub const USUAL_B_K: f64 = 2000.0;
+
 /// Kinds of step that are remembered while steps are told apart.
 const KNOWN: usize = 16;
 
@@ -777,9 +781,8 @@ impl<'a> Battery<'a> {
     fn new(base: &'a BatteryBase, drive: &Drive) -> Self {
         let rows = drive.len();
         let temperature_c = drive
-            .cell_temperature_c
-            .clone()
-            .or_else(|| drive.ambient_c.clone())
+            .battery_temperature()
+            .cloned()
             .unwrap_or_else(|| vec![REFERENCE_C; rows].into());
         Self {
             base,
@@ -849,11 +852,21 @@ impl<'a> Battery<'a> {
         }
     }
 
-    /// What temperature does to the resistance: after the stage of temperature.
-    pub fn warm(&mut self) {
+    /// The factor on every resistance that follows from temperature. Where no effect says how, resistances stay as they are between the
+    /// temperatures at which they are known, in °C, and follow it as is usual beyond.
+    pub fn warm(&mut self, known_at_c: Option<[f64; 2]>, drive: &Drive) {
         if let Some(b_k) = self.arrhenius_k {
             for (factor, t) in self.factor.iter_mut().zip(&self.temperature_c) {
                 *factor *= arrhenius(b_k, *t);
+            }
+        } else if let (Some([low, high]), Some(recorded)) =
+            (known_at_c, drive.battery_temperature())
+        {
+            for (factor, t) in self.factor.iter_mut().zip(recorded) {
+                let nearest = t.clamp(low, high);
+                if nearest != *t {
+                    *factor *= arrhenius(USUAL_B_K, *t) / arrhenius(USUAL_B_K, nearest);
+                }
             }
         }
     }

@@ -189,11 +189,13 @@ impl Point {
 pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
     // The same question is asked again and again, and fits have one answer.
     if used.is_none()
-        && let Some((model, sigma, cost)) = bench.known(model)
+        && let Some((mut found, sigma, cost)) = bench.known(model)
     {
+        // It says nothing of the recording that it was found in, and is not known by it.
+        found.nuisance.resistances_at_c = model.nuisance.resistances_at_c;
         return Fit {
             sigma,
-            ..Fit::of(bench, model, cost)
+            ..Fit::of(bench, found, cost)
         };
     }
     let from = model;

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use super::beyond::beyond_known;
 use super::fit;
 use super::normal::dot;
 use super::starts::begun;
@@ -70,6 +71,13 @@ impl<'a> Unfitted<'a> {
                 short(left / problem.noise)
             )
         })
+    }
+
+    /// What is taken of its resistances, where it is colder or warmer than what was fitted.
+    pub(super) fn beyond(&self, model: &Model) -> Option<String> {
+        let at_c = model.nuisance.resistances_at_c?;
+        let beyond = beyond_known(&self.bench.problem.drive, at_c)?;
+        Some(format!("{}: {beyond}", self.file.display()))
     }
 
     /// Error with a model.

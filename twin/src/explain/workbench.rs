@@ -107,6 +107,10 @@ impl Model {
     pub fn without(&self, index: usize) -> Self {
         let mut model = self.clone();
         model.members.remove(index);
+        if model.members.is_empty() {
+            // As designed, nothing was found at any temperature.
+            model.nuisance.resistances_at_c = None;
+        }
         model
     }
 

@@ -9,7 +9,7 @@ use toml_edit::{Array, DocumentMut, Item, Table, TableLike, Value, value};
 
 use super::{BEYOND_SOC, Battery};
 use crate::{
-    effects::{chain::Nuisance, ocv::bent},
+    effects::{chain::Nuisance, ocv::bent, scene::USUAL_B_K},
     failure::Failure,
 };
 
@@ -33,6 +33,8 @@ pub struct Shift {
     pub resistance: f64,
     /// Added to what the recorded current is above the battery's, in A.
     pub current_zero_a: f64,
+    /// Lowest and highest temperature, in °C, at which the resistances were found.
+    pub resistances_at_c: Option<[f64; 2]>,
     /// What the open-circuit voltage of a cell is above each line of its table, half-way between its points, in V.
     pub ocv_bend_v: Vec<f64>,
     /// Time by which a sensor's readings stand for an earlier moment than their row, in s.
@@ -63,6 +65,7 @@ impl Shift {
                 *mine = found;
             }
         }
+        self.resistances_at_c = self.resistances_at_c.or(nuisance.resistances_at_c);
         if self.ocv_bend_v.is_empty() {
             self.ocv_bend_v.clone_from(&nuisance.ocv_bend_v);
         }
@@ -177,6 +180,16 @@ impl Extension<'_> {
                 table,
                 "current_zero_uncertainty_a",
                 &format!("In its own recording twin explain found a current_zero_a of {found_a}."),
+            );
+        }
+        if let Some(at_c) = self.shift.resistances_at_c {
+            set(table, "resistances_at_c", value(Array::from_iter(at_c)));
+            said(
+                table,
+                "resistances_at_c",
+                &format!(
+                    "Where twin explain found them. Beyond, they follow temperature as is usual (Arrhenius, {USUAL_B_K} K)."
+                ),
             );
         }
         if !self.shift.ocv_bend_v.is_empty() {

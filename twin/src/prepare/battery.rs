@@ -6,7 +6,7 @@ use recording::error::number;
 
 use super::{Item, Purpose, Work, checks, counter, held::Freshness, series, start};
 use crate::{
-    effects::quantisation::lattice,
+    effects::{find_with, quantisation::lattice},
     explain,
     failure::Failure,
     model::Battery,
@@ -109,6 +109,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             cells,
             resistance_ohm: battery.resistance_ohm * cells,
             resistance_sigma: battery.resistance_uncertainty,
+            resistances_at_c: battery.resistances_at_c,
             current_zero_a: battery.current_zero_a,
             current_zero_sigma_a: battery.current_zero_uncertainty_a,
             alignment_s: match view {
@@ -221,6 +222,19 @@ pub(super) fn out_of_charge(problem: &Problem) -> Option<String> {
         number(*most_s),
         number(*first_s)
     ))
+}
+
+/// What is taken of resistances at temperatures at which the model file does not say what they are.
+pub(super) fn beyond_known(problem: &Problem) -> Option<String> {
+    let Base::Battery(base) = &problem.base else {
+        return None;
+    };
+    let says = |(id, values): &(&'static str, Vec<f64>)| {
+        find_with(id, values.len()).is_some_and(|effect| effect.says_temperature())
+    };
+    let is_open = problem.view == View::Voltage && !problem.modelled.iter().any(says);
+    let at_c = base.resistances_at_c.filter(|_| is_open)?;
+    explain::beyond_known(&problem.drive, at_c).map(|beyond| format!("{}: {beyond}", problem.name))
 }
 
 /// What of the battery is there and yet not compared.
