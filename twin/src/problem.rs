@@ -422,7 +422,34 @@ impl Problem {
     }
 }
 
+/// A current rests where it is at most this share of its largest size: below what instruments resolve of it.
+const AT_REST: f64 = 2e-3;
+/// Rests that are shorter in all tell nothing, in s.
+const LEAST_REST_S: f64 = 600.0;
+
 impl Drive {
+    /// What the reference is at rest, in the mean over time, and the time in s that it rests: steps that begin and end near nothing.
+    pub fn at_rest(&self) -> Option<(f64, f64)> {
+        let largest = self
+            .reference
+            .iter()
+            .fold(0.0_f64, |most, i| most.max(i.abs()));
+        let rests = |row: usize| self.reference[row].abs() <= AT_REST * largest;
+        let (mut integral, mut time_s) = (0.0, 0.0);
+        for rows in &self.segments {
+            for row in rows
+                .clone()
+                .skip(1)
+                .filter(|row| rests(row - 1) && rests(*row))
+            {
+                let step_s = self.t_s[row] - self.t_s[row - 1];
+                integral += 0.5 * (self.reference[row - 1] + self.reference[row]) * step_s;
+                time_s += step_s;
+            }
+        }
+        (time_s >= LEAST_REST_S).then(|| (integral / time_s, time_s))
+    }
+
     /// Number of rows.
     pub fn len(&self) -> usize {
         self.t_s.len()
@@ -585,6 +612,30 @@ mod tests {
             let [low, high] = [pair[0].min(pair[1]), pair[0].max(pair[1])];
             prop_assert!([from, to].iter().all(|end| (low - 1e-9..=high + 1e-9).contains(end)));
         }
+    }
+
+    #[test]
+    fn a_current_is_read_at_rest() {
+        // An hour of 30 A, then an hour that reads a tenth of a per mille, in steps of a minute.
+        let reference: Vec<f64> = (0..120)
+            .map(|k| if k < 60 { 30.0 } else { -0.003 })
+            .collect();
+        let mut drive = Drive {
+            t_s: (0..120).map(|k| f64::from(k) * 60.0).collect(),
+            reference: reference.into(),
+            segments: std::iter::once(0..120).collect(),
+            ..Drive::default()
+        };
+        let (reads, time_s) = drive.at_rest().expect("an hour at rest");
+        assert!(
+            (reads + 0.003).abs() < 1e-12 && time_s == 59.0 * 60.0,
+            "{reads} {time_s}"
+        );
+        // A drive that never rests, and one that rests for minutes.
+        drive.reference = (0..120).map(|k| 30.0 + f64::from(k)).collect();
+        assert_eq!(drive.at_rest(), None);
+        drive.reference = (0..120).map(|k| if k < 110 { 30.0 } else { 0.0 }).collect();
+        assert_eq!(drive.at_rest(), None);
     }
 
     #[test]

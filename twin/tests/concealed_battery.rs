@@ -262,6 +262,7 @@ fn a_consumer_may_be_a_recorded_current_that_is_off() {
     assert_eq!(report.effects[0].id, "parasitic-load");
     let said = report.remarks.join("\n");
     assert!(said.contains("A too low all along"), "{said}");
+    assert!(said.contains("is stated by current_zero_a"), "{said}");
     // None that supplies.
     let report = unseen(-0.08, 12);
     assert_eq!(report.verdict, Verdict::Ambiguous, "{:?}", report.decisions);

@@ -435,8 +435,11 @@ pub(super) fn times_found(
 /// What error of a battery's recorded current would look the same as a named effect, and whether that is likelier than the effect.
 pub(super) fn current_off(bench: &Workbench<'_>, selection: &Selection) -> Vec<(String, bool)> {
     let members = &selection.fit.model.members;
-    let off = selection.named.iter().filter_map(|named| {
-        let Member { effect, values } = &members[named.index];
+    let named = || {
+        let named = selection.named.iter();
+        named.map(|named| &members[named.index])
+    };
+    let off = named().filter_map(|Member { effect, values }| {
         let error = match effect.in_the_current(values, &bench.scale)? {
             CurrentError::Offset(by_a) => format!(
                 "{} A too {} all along",
@@ -459,7 +462,33 @@ pub(super) fn current_off(bench: &Workbench<'_>, selection: &Selection) -> Vec<(
             ),
         })
     });
-    off.collect()
+    let is_zero = |Member { effect, values }: &Member| {
+        matches!(
+            effect.in_the_current(values, &bench.scale),
+            Some(CurrentError::Offset(_))
+        )
+    };
+    let hint = named().any(is_zero).then(|| zero_hint(bench.problem));
+    off.chain(hint.flatten().map(|hint| (hint, false)))
+        .collect()
+}
+
+/// What a recorded current says of its own zero, and how to state it, where the model file takes it to be exact.
+fn zero_hint(problem: &Problem) -> Option<String> {
+    let Base::Battery(base) = &problem.base else {
+        return None;
+    };
+    let rests = problem.drive.at_rest().map(|(reads_a, time_s)| {
+        format!(
+            "the recorded current, where it rests ({} h in all), reads {} A in the mean; ",
+            short(time_s / 3600.0),
+            short(reads_a)
+        )
+    });
+    (base.current_zero_sigma_a == 0.0).then(|| {
+        rests.unwrap_or_default()
+            + "a zero that it may have is stated by current_zero_a and current_zero_uncertainty_a"
+    })
 }
 
 /// What is written into the extended model file.
