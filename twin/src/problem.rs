@@ -626,11 +626,9 @@ mod tests {
             segments: std::iter::once(0..120).collect(),
             ..Drive::default()
         };
-        let (reads, time_s) = drive.at_rest().expect("an hour at rest");
-        assert!(
-            (reads + 0.003).abs() < 1e-12 && time_s == 59.0 * 60.0,
-            "{reads} {time_s}"
-        );
+        let (reads, time_s) = drive.at_rest().unwrap_or_default();
+        assert!((reads + 0.003).abs() < 1e-12, "{reads}");
+        assert_eq!(time_s, 59.0 * 60.0);
         // A drive that never rests, and one that rests for minutes.
         drive.reference = (0..120).map(|k| 30.0 + f64::from(k)).collect();
         assert_eq!(drive.at_rest(), None);
