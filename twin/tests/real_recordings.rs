@@ -6,6 +6,7 @@
 use std::{fs, path::Path, process::Command};
 
 use serde_json::Value;
+use twin::problem::Drive;
 
 const CARDS: &str = "../recordings/gpu-power-sensor";
 const SENSOR: &str = "../models/gpu-power-sensor.toml";
@@ -268,25 +269,34 @@ fn a_cyclers_counter_tells_the_charge_of_a_pulse_test() {
     assert!(left_on_blocks(&report) < 0.5, "{}", left_on_blocks(&report));
 }
 
-/// What the model file states of the cycler's zero is what its pulse test reads where no current flows.
+/// What a file of the Leaf's reads where no current flows, in A, and for how long, in s.
+fn at_rest(file: &str) -> (f64, f64) {
+    let path = format!(
+        "{}/../recordings/leaf-cell/{file}",
+        env!("CARGO_MANIFEST_DIR")
+    );
+    let recording = recording::csv::read(Path::new(&path)).unwrap();
+    let current = recording.need("i_ref_a").unwrap();
+    let drive = Drive {
+        t_s: recording.time_s().iter().copied().collect(),
+        reference: current.iter().copied().collect(),
+        segments: std::iter::once(0..current.len()).collect(),
+        ..Drive::default()
+    };
+    drive.at_rest().expect("rests")
+}
+
+/// What the model file states of the cycler's zero is what its pulse test reads where no current flows; another test reads another.
 #[test]
 fn a_cyclers_zero_is_what_it_reads_at_rest() {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let recording =
-        recording::csv::read(&folder.join("recordings/leaf-cell/hppc-25c.csv")).unwrap();
-    let (t_s, i) = (recording.time_s(), recording.need("i_ref_a").unwrap());
-    // Steps of 10 mA; a minute is its longest stride.
-    let rests = (1..i.len())
-        .filter(|row| i[row - 1].abs() < 0.02 && i[*row].abs() < 0.02)
-        .map(|row| (t_s[row] - t_s[row - 1], i[row]))
-        .filter(|(step_s, _)| *step_s < 100.0);
-    let (time_s, charge_c) = rests.fold((0.0, 0.0), |(time_s, charge_c), (step_s, i)| {
-        (time_s + step_s, charge_c + step_s * i)
-    });
+    let (reads_a, time_s) = at_rest("hppc-25c.csv");
     assert!((time_s / 3600.0 - 10.0).abs() < 0.1, "{time_s} s at rest");
-    let model = twin::model::Model::read(&folder.join("models/leaf-cell.toml")).unwrap();
+    let path = format!("{}/../models/leaf-cell.toml", env!("CARGO_MANIFEST_DIR"));
+    let model = twin::model::Model::read(Path::new(&path)).unwrap();
     let stated_a = model.battery.unwrap().current_zero_a;
-    assert!((charge_c / time_s - stated_a).abs() < 5e-5, "{stated_a}");
+    assert!((reads_a - stated_a).abs() < 5e-5, "{reads_a} {stated_a}");
+    let (reads_a, _) = at_rest("1c-discharge.csv");
+    assert!((reads_a + 0.0010).abs() < 5e-5, "{reads_a}");
 }
 
 /// Some loops of a file, as a recording of a sensor that should follow its field: a second for each point.

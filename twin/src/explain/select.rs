@@ -263,9 +263,14 @@ impl Search<'_, '_> {
     fn inherit(&mut self, before: &Fit, index: usize, after: &Fit) {
         let p99 = p99_of(&self.placebo_p99, before.model.members[index].id());
         for id in &after.model.ids()[new(before, after)..] {
-            self.placebo_p99.retain(|(known, _)| known != id);
-            self.placebo_p99.push((id, p99));
+            self.limit(id, p99);
         }
+    }
+
+    /// Has another limit for an effect.
+    fn limit(&mut self, id: &'static str, p99: f64) {
+        self.placebo_p99.retain(|(known, _)| *known != id);
+        self.placebo_p99.push((id, p99));
     }
 
     /// Leaves out what is no longer missed with the others there, of the `looked_at` effects that are missed least.
@@ -317,8 +322,7 @@ impl Search<'_, '_> {
                     "{id} kept, with the others there: placebos take {} beside them.",
                     percent(p99)
                 ));
-                self.placebo_p99.retain(|(known, _)| *known != id);
-                self.placebo_p99.push((id, p99));
+                self.limit(id, p99);
             }
             let Some((index, without, why)) = needless else {
                 return leaner;
