@@ -19,7 +19,10 @@ mod summary;
 mod table;
 mod tool;
 
-use std::{fs, path::PathBuf, process, process::ExitCode, thread, time::Duration};
+use std::{
+    fs, io::ErrorKind, io::Write as _, path::Path, path::PathBuf, process, process::ExitCode,
+    thread, time::Duration,
+};
 
 use anyhow::{Context, Result};
 use clap::{Args, Parser, Subcommand};
@@ -124,21 +127,28 @@ fn main() -> ExitCode {
                 ExitCode::from(MISSING)
             }
         },
-        Command::List { plan, root, seeds } => {
-            match real::expected(&root.join("proof/expected.toml")) {
-                Ok(real) => {
-                    for planned in plan::plan(plan, &real, seeds) {
-                        println!("{}", planned.case.id);
-                    }
-                    ExitCode::SUCCESS
-                }
-                Err(error) => {
-                    eprintln!("error: {error:#}");
-                    ExitCode::from(MISSING)
-                }
+        Command::List { plan, root, seeds } => match list(plan, &root, seeds) {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => {
+                eprintln!("error: {error:#}");
+                ExitCode::from(MISSING)
             }
+        },
+    }
+}
+
+fn list(extent: Extent, root: &Path, seeds: u64) -> Result<()> {
+    let real = real::expected(&root.join("proof/expected.toml"))?;
+    let mut out = std::io::stdout().lock();
+    for planned in plan::plan(extent, &real, seeds) {
+        match writeln!(out, "{}", planned.case.id) {
+            Ok(()) => {}
+            // A reader that has seen enough (`| head`) is no failure.
+            Err(error) if error.kind() == ErrorKind::BrokenPipe => break,
+            Err(error) => return Err(error).context("standard output"),
         }
     }
+    Ok(())
 }
 
 fn run(arguments: &Run) -> Result<bool> {

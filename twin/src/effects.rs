@@ -304,6 +304,17 @@ fn reach_of_shift(earlier_s: f64) -> [f64; 2] {
     [earlier_s.max(0.0), (-earlier_s).max(0.0)]
 }
 
+/// What of a battery's base an effect can say.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Says {
+    /// What the ohmic resistance is.
+    Resistance,
+    /// How resistances follow temperature.
+    ResistanceByTemperature,
+    /// What the recorded current is off by.
+    CurrentZero,
+}
+
 /// An error of the recorded current that does to a battery what an effect does.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CurrentError {
@@ -396,19 +407,9 @@ pub trait Effect: Sync {
         &[]
     }
 
-    /// Whether it says what the ohmic resistance is: nothing of it is then left open by the model file.
-    fn says_resistance(&self) -> bool {
-        false
-    }
-
-    /// Whether it says how resistances follow temperature: they do not do so as is usual then.
-    fn says_temperature(&self) -> bool {
-        false
-    }
-
-    /// Whether it says what the recorded current is off by: nothing of its zero is then left open by the model file.
-    fn says_current_zero(&self) -> bool {
-        false
+    /// What it says of the base: nothing of that is left open then.
+    fn says(&self) -> Option<Says> {
+        None
     }
 
     /// Whether it cuts or rounds what comes in, noise with it: what comes out is no longer a signal with the stated noise on it.

@@ -1,7 +1,7 @@
 //! A consumer ahead of the sensor.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, CurrentError, Effect, Parameter, Search, Stage, counting};
+use super::{Card, Clues, CurrentError, Effect, Parameter, Says, Search, Stage, counting};
 use crate::problem::Problem;
 
 /// Hours in which the largest one empties the battery: a consumer that does so within a day is not overlooked.
@@ -48,8 +48,8 @@ impl Effect for ParasiticLoad {
         (values[0] < 0.0).then_some("a consumer supplies no current")
     }
 
-    fn says_current_zero(&self) -> bool {
-        true
+    fn says(&self) -> Option<Says> {
+        Some(Says::CurrentZero)
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

@@ -1,7 +1,7 @@
 //! Ohmic resistance is not the stated one.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage};
+use super::{Card, Clues, Effect, Parameter, Says, Search, Stage};
 use crate::problem::{Base, Problem, View};
 
 /// See [`CARD`].
@@ -38,8 +38,8 @@ impl Effect for Resistance {
         vec![vec![1.1]]
     }
 
-    fn says_resistance(&self) -> bool {
-        true
+    fn says(&self) -> Option<Says> {
+        Some(Says::Resistance)
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

@@ -1,7 +1,7 @@
 //! Resistance follows temperature.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage};
+use super::{Card, Clues, Effect, Parameter, Says, Search, Stage};
 use crate::problem::{Problem, View};
 
 /// See [`CARD`].
@@ -39,8 +39,8 @@ impl Effect for ResistanceTemperature {
         vec![vec![300.0], vec![2000.0], vec![5000.0]]
     }
 
-    fn says_temperature(&self) -> bool {
-        true
+    fn says(&self) -> Option<Says> {
+        Some(Says::ResistanceByTemperature)
     }
 
     /// Over the tens of kelvin of a recording the law holds within a percent.

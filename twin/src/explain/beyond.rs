@@ -6,7 +6,7 @@ use super::select::beaten;
 use super::told::short;
 use super::workbench::{Member, Workbench};
 use crate::effects::scene::{USUAL_B_K, arrhenius};
-use crate::effects::{LIBRARY, find_with};
+use crate::effects::{Effect, LIBRARY, Says, find_with};
 use crate::problem::{Base, Drive, View};
 
 /// Resistances that are taken to be other than where they are known are told from here on, in %.
@@ -27,19 +27,22 @@ pub(super) fn found_at_c(bench: &Workbench<'_>, found: &Fit) -> Option<[f64; 2]>
         .iter()
         .map(|member| member.effect)
         .chain(stated);
-    if !is_open || effects.any(|effect| effect.says_temperature()) {
+    if !is_open || effects.any(by_temperature) {
         return None;
     }
     let at_c = problem.drive.battery_temperatures()?;
-    let law = LIBRARY
-        .into_iter()
-        .find(|effect| effect.says_temperature())?;
+    let law = LIBRARY.into_iter().find(|effect| by_temperature(*effect))?;
     let mut usual = model.with(Member {
         effect: law,
         values: vec![USUAL_B_K],
     });
     usual.held = Some((model.members.len(), 0));
     (!beaten(bench, &fit(bench, &usual, None), found)).then_some(at_c)
+}
+
+/// Whether an effect says how resistances follow temperature.
+pub fn by_temperature(effect: &dyn Effect) -> bool {
+    effect.says() == Some(Says::ResistanceByTemperature)
 }
 
 /// What is taken of a recording's resistances where it is colder or warmer than what is known of them, in °C, if that matters.

@@ -8,8 +8,8 @@ use super::normal::{dot, forget, normal, solve, sum_of};
 use super::robust::{huber, loss, weight};
 use super::slope::{Slope, change, coordinates, rounds, slope, unrounded};
 use super::workbench::{Model, Workbench};
-use crate::effects::Search;
 use crate::effects::chain::Begun;
+use crate::effects::{Says, Search};
 use crate::problem::Base;
 
 /// Steps of Levenberg–Marquardt in one go.
@@ -203,10 +203,10 @@ pub fn fit(bench: &Workbench<'_>, model: &Model, used: Option<&[f64]>) -> Fit {
     if !bench.aligns(&model) {
         model.nuisance.alignment_s = 0.0;
     }
-    if model.says_resistance() {
+    if model.says(Says::Resistance) {
         model.nuisance.resistance = 0.0;
     }
-    if model.says_current_zero() {
+    if model.says(Says::CurrentZero) {
         model.nuisance.current_zero_a = 0.0;
     }
     let predicted = bench.run(&model);

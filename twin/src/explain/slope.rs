@@ -6,8 +6,8 @@ use super::normal::dot;
 use super::robust::spread;
 use super::starts;
 use super::workbench::{Model, Workbench};
-use crate::effects::Search;
 use crate::effects::chain::{Change, Nuisance};
+use crate::effects::{Says, Search};
 use crate::problem::Base;
 
 /// What the model file says of the base is off by this many of its own standard uncertainties at most: beyond them it is no
@@ -191,9 +191,14 @@ fn resistance_sigma(bench: &Workbench<'_>) -> Option<f64> {
 pub(super) fn current_zero_sigma_a(bench: &Workbench<'_>, model: &Model) -> Option<f64> {
     match &bench.problem.base {
         Base::Battery(base) => Some(base.current_zero_sigma_a)
-            .filter(|sigma_a| *sigma_a > 0.0 && !model.says_current_zero()),
+            .filter(|sigma_a| *sigma_a > 0.0 && !model.says(Says::CurrentZero)),
         Base::Sensor(_) => None,
     }
+}
+
+/// A zero of the recorded current within what its standard uncertainty allows, both in A.
+pub(super) fn current_zero_within_a(zero_a: f64, sigma_a: f64) -> f64 {
+    zero_a.clamp(-BASE_OFF * sigma_a, BASE_OFF * sigma_a)
 }
 
 /// Whether a value of the base stands where its uncertainty ends, and the residual would have it beyond: it is free no more, and
@@ -226,9 +231,9 @@ fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta
             model.nuisance.resistance = resistance.clamp((-most).max(-0.9), most);
         }
         Coordinate::CurrentZero => {
-            let most_a = current_zero_sigma_a(bench, model).map_or(0.0, |it| BASE_OFF * it);
+            let sigma_a = current_zero_sigma_a(bench, model).unwrap_or_default();
             let zero_a = model.nuisance.current_zero_a + delta;
-            model.nuisance.current_zero_a = zero_a.clamp(-most_a, most_a);
+            model.nuisance.current_zero_a = current_zero_within_a(zero_a, sigma_a);
         }
         Coordinate::OcvBend(bend) => {
             let (line, sigma_v) = bench.bends[bend];
@@ -304,7 +309,7 @@ pub(super) fn coordinates(
             ));
         }
         let is_voltage = bench.problem.view == crate::problem::View::Voltage;
-        if base.resistance_sigma > 0.0 && is_voltage && !model.says_resistance() {
+        if base.resistance_sigma > 0.0 && is_voltage && !model.says(Says::Resistance) {
             all.push((
                 Coordinate::Resistance,
                 1e-4,

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use super::normal::dot;
 use super::robust::{huber, spread, weights};
-use super::slope::{BASE_OFF, current_zero_sigma_a};
+use super::slope::{BASE_OFF, current_zero_sigma_a, current_zero_within_a};
 use super::workbench::{Model, Workbench};
 use crate::effects::chain::Nuisance;
 use crate::problem::{Base, Problem};
@@ -161,8 +161,7 @@ pub(super) fn begun(bench: &Workbench<'_>, model: Model) -> (Model, Vec<f64>) {
         let prior = sigma_a.powi(-2);
         let step =
             (dot(&weighted, &here.1) - prior * zero_a) / (dot(&weighted, &change) / by + prior);
-        let most_a = BASE_OFF * sigma_a;
-        let tried = with_zero(&here.0, (zero_a + step).clamp(-most_a, most_a));
+        let tried = with_zero(&here.0, current_zero_within_a(zero_a + step, sigma_a));
         let cost = |(model, residual): &(Model, Vec<f64>)| {
             let starts = bench.starts.iter();
             let off = starts.map(|start| start.at(&model.nuisance) / start.sigma);

@@ -19,7 +19,7 @@ use super::whiten::Whitening;
 use crate::effects::chain::{Begun, Chain, Change, Nuisance, Variation};
 use crate::effects::ocv::bend_v;
 use crate::effects::scene::{ROUNDS, Scale, charge_range};
-use crate::effects::{Clues, Effect, LIBRARY, Mark, Parameter, Stage, find_with};
+use crate::effects::{Clues, Effect, LIBRARY, Mark, Parameter, Says, Stage, find_with};
 use crate::problem::{Base, Coloured, Drive, Moments, Problem, Series, View, evenly};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row). [`Problem::thinned`]
@@ -82,18 +82,11 @@ impl Model {
         self.members.iter().any(|member| member.id() == id)
     }
 
-    /// Whether one of its effects says what the ohmic resistance is.
-    pub fn says_resistance(&self) -> bool {
+    /// Whether one of its effects says this of the base.
+    pub fn says(&self, what: Says) -> bool {
         self.members
             .iter()
-            .any(|member| member.effect.says_resistance())
-    }
-
-    /// Whether one of its effects says what the recorded current is off by.
-    pub fn says_current_zero(&self) -> bool {
-        self.members
-            .iter()
-            .any(|member| member.effect.says_current_zero())
+            .any(|member| member.effect.says() == Some(what))
     }
 
     /// With one more effect.

@@ -7,7 +7,7 @@ use recording::error::number;
 use super::{Item, Purpose, Work, checks, counter, held::Freshness, series, start};
 use crate::{
     effects::{find_with, quantisation::lattice},
-    explain,
+    explain::{self, by_temperature},
     failure::Failure,
     model::Battery,
     problem::{Accuracy, Base, BatteryBase, Coloured, Observed, Problem, View},
@@ -230,7 +230,7 @@ pub(super) fn beyond_known(problem: &Problem) -> Option<String> {
         return None;
     };
     let says = |(id, values): &(&'static str, Vec<f64>)| {
-        find_with(id, values.len()).is_some_and(|effect| effect.says_temperature())
+        find_with(id, values.len()).is_some_and(by_temperature)
     };
     let is_open = problem.view == View::Voltage && !problem.modelled.iter().any(says);
     let at_c = base.resistances_at_c.filter(|_| is_open)?;
