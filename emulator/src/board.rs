@@ -494,6 +494,10 @@ impl Outside for Board {
         self.i2c_bus.event(event, at, &mut self.converter)
     }
 
+    fn i2c_spurious_bus_error(&mut self) -> bool {
+        self.i2c_bus.take_spurious_bus_error()
+    }
+
     fn i2c_lines(&mut self, at: Ticks) -> (bool, bool) {
         self.i2c_bus.lines(at)
     }

@@ -92,7 +92,7 @@ pub const CATALOGUE: [Entry; 24] = [
     entry(
         "F11",
         "the I²C bus fails",
-        "sda (held in the middle of a byte), nack, arbitration, glitch or short, how long the short (100ms)",
+        "sda (held in the middle of a byte), nack, arbitration, glitch, spurious (a bus error that is none) or short, how long the short (100ms)",
     ),
     entry("F12", "the ADS1100 is reset", "none"),
     entry(
@@ -560,6 +560,7 @@ impl Fault {
                     ("nack", I2cFault::NackAddresses(3)),
                     ("arbitration", I2cFault::LoseArbitration(1)),
                     ("glitch", I2cFault::Glitch),
+                    ("spurious", I2cFault::SpuriousBusErrors(1)),
                     ("short", short),
                 ];
                 Self::I2c(

@@ -32,6 +32,9 @@ pub enum I2cFault {
     LoseArbitration(u32),
     /// So many byte events end in a start or stop seen at the wrong place.
     BusErrors(u32),
+    /// So many events have the peripheral raise BERR though nothing is wrong: the transfer goes on (errata ES0182, spurious bus error
+    /// detection in master mode).
+    SpuriousBusErrors(u32),
     /// In the middle of the next data byte the slave loses step: it holds SDA low for the rest of the byte and then
     /// until it has got so many falling edges of SCL more.
     HoldSdaInByte {
@@ -116,6 +119,7 @@ pub struct I2cBus {
     nack_data: u32,
     lose_arbitration: u32,
     bus_errors: u32,
+    spurious_bus_errors: u32,
     hold_in_byte: Option<u8>,
     /// Falling edges of SCL until the slave lets go of SDA.
     held: Option<u8>,
@@ -160,6 +164,7 @@ impl I2cBus {
         self.nack_data = 0;
         self.lose_arbitration = 0;
         self.bus_errors = 0;
+        self.spurious_bus_errors = 0;
         self.hold_in_byte = None;
         self.held = None;
         self.sda_short = Short::default();
@@ -181,6 +186,7 @@ impl I2cBus {
                 I2cFault::NackData(count) => self.nack_data += count,
                 I2cFault::LoseArbitration(count) => self.lose_arbitration += count,
                 I2cFault::BusErrors(count) => self.bus_errors += count,
+                I2cFault::SpuriousBusErrors(count) => self.spurious_bus_errors += count,
                 I2cFault::HoldSdaInByte { clocks } => self.hold_in_byte = Some(clocks),
                 I2cFault::HoldSda { clocks } => self.held = (clocks > 0).then_some(clocks),
                 I2cFault::SdaLow(length) => self.sda_short = Short::new(from, length),
@@ -204,6 +210,13 @@ impl I2cBus {
         if let Some(left) = self.held {
             self.held = left.checked_sub(1).filter(|left| *left > 0);
         }
+    }
+
+    /// Whether the peripheral takes the event that has just ended for a bus error, and is wrong ([`I2cFault::SpuriousBusErrors`]).
+    pub fn take_spurious_bus_error(&mut self) -> bool {
+        let left = self.spurious_bus_errors.checked_sub(1);
+        self.spurious_bus_errors = left.unwrap_or_default();
+        left.is_some()
     }
 
     /// Levels of SCL and SDA as the peripheral's filters see them, without what the MCU itself pulls. A glitch is seen

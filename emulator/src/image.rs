@@ -88,6 +88,18 @@ impl Image {
     }
 }
 
+impl Image {
+    /// Address of the symbol whose name has `part` in it; `None` unless there is just one.
+    pub fn symbol(&self, part: &str) -> Option<u32> {
+        let file = ElfFile32::<LittleEndian>::parse(self.elf.as_slice()).ok()?;
+        let mut found = file
+            .symbols()
+            .filter(|symbol| symbol.name().is_ok_and(|name| name.contains(part)));
+        let address = found.next()?.address();
+        found.next().is_none().then_some(address)?.try_into().ok()
+    }
+}
+
 type Contents = (Vec<u8>, (u32, u32), Option<u32>);
 
 fn contents(bytes: &[u8]) -> Result<Contents, String> {

@@ -27,6 +27,10 @@ use crate::time::Ticks;
 const PERIPHERALS: (u64, u64) = (0x4000_0000, 0x0008_0000);
 /// DBGMCU, its four registers. Nobody debugs: they keep what is written, and it has no effect.
 const DEBUG: (u64, u64) = (0xE004_2000, 16);
+/// Its first, IDCODE, is DEV_ID of the STM32F405, and REV_ID above (RM0090, MCU device ID code).
+const DEVICE_ID: u32 = 0x413;
+/// Revision Z; A is 0x1000.
+const REVISION_Z: u16 = 0x1001;
 /// Factory values and unique ID.
 const SYSTEM_MEMORY: u64 = 0x1FFF_7A00;
 /// The longest time that a polling loop is let turn at once.
@@ -107,6 +111,7 @@ pub struct Machine<'table> {
     cpu: Cpu,
     bus: Arc<SystemBus>,
     memories: Memories,
+    debug: Arc<RamStore>,
     log: Option<Log<'table>>,
     log_lines: Vec<String>,
     now: Ticks,
@@ -176,6 +181,7 @@ impl<'table> Machine<'table> {
         let flash = Arc::new(RomStore::new(image.flash.clone()));
         let factory = Arc::new(RomStore::new(system_memory::content().to_vec()));
         let bus = Arc::new(SystemBus::new(board));
+        let debug = Arc::new(RamStore::new(DEBUG.1));
         // Most accesses are fetches: a table by page finds their memory faster than a search.
         let space = AddressSpace::new("stm32f405", 32).with_dispatch(DispatchPolicy::Dense {
             page_bits: 16,
@@ -206,10 +212,7 @@ impl<'table> Machine<'table> {
                 Region::io("peripherals", PERIPHERALS.1, Arc::<SystemBus>::clone(&bus)),
                 PERIPHERALS.0,
             )?;
-            map.map(
-                Region::ram("dbgmcu", Arc::new(RamStore::new(DEBUG.1))),
-                DEBUG.0,
-            )?;
+            map.map(Region::ram("dbgmcu", Arc::clone(&debug)), DEBUG.0)?;
         }
         debug_assert_eq!(image.flash.len(), FLASH_LENGTH as usize);
         let cpu = Cpu::new(Arc::new(space));
@@ -217,6 +220,7 @@ impl<'table> Machine<'table> {
             cpu,
             bus,
             memories,
+            debug,
             log,
             log_lines: Vec::new(),
             now: Ticks(0),
@@ -228,8 +232,16 @@ impl<'table> Machine<'table> {
             held_until: Ticks(0),
             exact: false,
         };
+        machine.set_revision(REVISION_Z);
         machine.power_cycle();
         Ok(machine)
+    }
+
+    /// Another revision of the chip, as IDCODE tells it.
+    pub fn set_revision(&mut self, rev_id: u16) {
+        let idcode = u32::from(rev_id) << 16 | DEVICE_ID;
+        // The register is there.
+        let _ = self.debug.write_at(0, &idcode.to_le_bytes());
     }
 
     /// Executes every turn of polling loops instead of letting them pass at once: slower, and the reference for it.

@@ -154,6 +154,10 @@ pub trait Outside {
     fn spi(&mut self, bus: SpiBus, byte: SpiByte) -> u8;
     /// An event on I²C1.
     fn i2c(&mut self, event: I2cEvent, at: Ticks) -> I2cAnswer;
+    /// Whether the peripheral takes an event that has ended for a bus error though it was none. Asked once after each.
+    fn i2c_spurious_bus_error(&mut self) -> bool {
+        false
+    }
     /// Levels of SCL and SDA as seen by the MCU's pins, when it does not pull them itself.
     fn i2c_lines(&mut self, at: Ticks) -> (bool, bool);
     /// The voltage at ADC1's external input `channel` (0 … 15), in V.

@@ -57,6 +57,21 @@ fn a_brown_out_detector_that_is_off_is_told_at_each_start() {
     assert_eq!(told(&mut rig), 1);
 }
 
+/// Errata ES0182: the first revision's prefetch must stay off.
+#[test]
+fn the_flash_is_prefetched_but_on_revision_a() {
+    let firmware = firmware();
+    for (rev_id, prefetches) in [(0x1000, false), (0x1001, true), (0x100F, true)] {
+        let mut rig = Rig::new(&firmware, driving(10.0)).unwrap();
+        rig.machine.set_revision(rev_id);
+        rig.run_s(0.1).unwrap();
+        rig.machine.flash(|flash| {
+            assert_eq!(flash.prefetch(), prefetches, "{rev_id:#x}");
+            assert_eq!(flash.wait_states(), 5);
+        });
+    }
+}
+
 /// docs/architecture.md: 0.5 ms of jitter; here with a bus that others fill, a client on RS485, a sensor supply that
 /// moves, so that the meter's factors are worked out anew, and from the first frame on.
 #[test]

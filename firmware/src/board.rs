@@ -39,8 +39,12 @@ const FLASH_SPI: spi::Settings = spi::Settings {
     baud: 0,
 };
 /// For its clock and data: as they come out of a reset, pins follow 4 MHz, and with this 50 MHz (STM32F405 data sheet,
-/// I/O AC characteristics, 2.7 … 3.6 V; *assumed*, as in the emulator). The meter's 2.625 MHz and all else stay below.
+/// I/O AC characteristics, 2.7 … 3.6 V; *assumed*, as in the emulator).
 const FLASH_EDGES: Speed = Speed::High;
+/// For the meter's clock, though 2.625 MHz is slow: the SPI strobes what it receives by the clock that comes back through this pad, and
+/// where that is late against APB2 the last bit of a byte is the one of the byte before (errata ES0182, corrupted last bit of data
+/// received in master mode with delayed SCK feedback).
+const METER_CLOCK_EDGES: Speed = Speed::VeryHigh;
 
 /// How long the range flag has been high: TIM4 counts microseconds while its channel 1, the same line, is high. It sees what
 /// no interrupt is fast enough for.
@@ -239,7 +243,7 @@ impl Board {
 
         retain::note_stage(Stage::Clock);
         let mut rcc = dp.RCC;
-        clock::start(&rcc, &dp.FLASH);
+        clock::start(&rcc, &dp.FLASH, &dp.DBGMCU);
 
         retain::note_stage(Stage::Peripherals);
         time::start(dp.TIM2, &mut rcc);
@@ -257,7 +261,7 @@ impl Board {
         let _rs485_tx = /*       PA2  */ a.pa2.into_alternate::<7>();
         let _rs485_rx = /*       PA3  */ a.pa3.into_alternate::<7>().internal_pull_up(true);
         let meter_select = /*    PA4  */ a.pa4.into_push_pull_output_in_state(PinState::High);
-        let _meter_clock = /*    PA5  */ a.pa5.into_alternate::<5>();
+        let _meter_clock = /*    PA5  */ a.pa5.into_alternate::<5>().speed(METER_CLOCK_EDGES);
         let _meter_miso = /*     PA6  */ a.pa6.into_alternate::<5>();
         let _meter_mosi = /*     PA7  */ a.pa7.into_alternate::<5>();
         let _can_rx = /*         PA11 */ a.pa11.into_alternate::<9>().internal_pull_up(true);

@@ -2,7 +2,7 @@
 //!
 //! Written out for this one tree: the HAL's search for dividers costs 1.5 kB of flash.
 
-use stm32f4xx_hal::pac::{FLASH, RCC};
+use stm32f4xx_hal::pac::{DBGMCU, FLASH, RCC};
 
 /// Core and AHB; SysTick counts it.
 pub const CORE_HZ: u32 = 168_000_000;
@@ -11,14 +11,19 @@ pub const APB1_HZ: u32 = CORE_HZ / 4;
 /// SPI1, among others.
 pub const APB2_HZ: u32 = CORE_HZ / 2;
 
+/// DBGMCU_IDCODE, REV_ID of revision A (RM0090, MCU device ID code).
+const REVISION_A: u16 = 0x1000;
+
 /// Starts crystal and PLL and changes over to them (RM0090, reset and clock control).
 ///
 /// It waits without a bound, for nothing works without a clock: the watchdog, started before, ends the wait.
-pub fn start(rcc: &RCC, flash: &FLASH) {
+pub fn start(rcc: &RCC, flash: &FLASH, debug: &DBGMCU) {
+    // The first revision's prefetch must stay off (errata ES0182, ART accelerator prefetch queue instruction is not supported).
+    let prefetches = debug.idcode().read().rev_id().bits() != REVISION_A;
     // Five wait states above 150 MHz at 2.7 … 3.6 V (RM0090, table 10), set before the clock rises.
     flash.acr().write(|w| {
         w.latency().ws5();
-        w.prften().set_bit();
+        w.prften().bit(prefetches);
         w.icen().set_bit();
         w.dcen().set_bit()
     });

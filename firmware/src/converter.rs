@@ -28,7 +28,7 @@ const ADDRESSES: [Address; 8] = [
 pub enum Progress {
     /// Under way.
     Busy,
-    /// Finished, but the first since the chip had power: no result.
+    /// Finished, but perhaps not the one that was started: no result.
     Discarded,
     /// Finished.
     Ready(Sample),
@@ -90,19 +90,30 @@ impl Converter {
         }
     }
 
-    /// Starts a conversion with the settings of the configuration.
+    /// Starts a conversion with the settings of the configuration; until a chip has answered, at whichever address one does.
     pub fn start(&mut self, config: &ConverterConfig) -> Result<(), ConverterFault> {
         let wanted = settings(config);
-        let result = match &mut self.chip {
-            Some(chip) => {
-                if chip.settings() != wanted {
-                    chip.set_settings(wanted);
+        let mut untried = ADDRESSES.len();
+        loop {
+            let address = self.address;
+            let result = match &mut self.chip {
+                Some(chip) => {
+                    if chip.settings() != wanted {
+                        chip.set_settings(wanted);
+                    }
+                    chip.start()
                 }
-                chip.start()
+                None => Err(Error::NotStarted),
+            };
+            let Err(error) = result else {
+                return Ok(());
+            };
+            let fault = self.on_error(&error, config);
+            untried -= 1;
+            if untried == 0 || self.address == address {
+                return Err(fault);
             }
-            None => Err(Error::NotStarted),
-        };
-        result.map_err(|error| self.on_error(&error, config))
+        }
     }
 
     /// How far the conversion is.
@@ -120,6 +131,12 @@ impl Converter {
             }
             Err(error) => Err(self.on_error(&error, config)),
         }
+    }
+
+    /// The longest that the conversion under way takes from its start.
+    pub fn longest_ms(&self) -> u32 {
+        let longest_us = self.chip.as_ref().map_or(0, Ads1100::timeout_us);
+        longest_us.div_ceil(1_000)
     }
 
     /// A conversion did not end in time.

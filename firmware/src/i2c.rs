@@ -36,7 +36,7 @@ pub enum Error {
     NoAddressAcknowledge,
     /// A data byte was not acknowledged.
     NoDataAcknowledge,
-    /// Start or stop at the wrong place.
+    /// A failed acknowledge where none is asked for.
     Bus,
     /// Another master, or a line that does not follow.
     ArbitrationLost,
@@ -153,7 +153,12 @@ impl Bus {
                 return Err(Error::ArbitrationLost);
             }
             if status.berr().bit_is_set() {
-                return Err(Error::Bus);
+                // A master may see one where nothing is wrong, and the transfer goes on (errata ES0182, spurious bus error detection in
+                // master mode): cleared, and no more. After a real one nothing more comes, and the time ends.
+                self.i2c.sr1().write(|w| {
+                    // SAFETY: the other errors are cleared by writing 0, which 1 leaves; the flags ignore it.
+                    unsafe { w.bits(ERRORS & !BERR) }
+                });
             }
             if done(status.bits()) {
                 return Ok(());
@@ -235,10 +240,9 @@ impl Bus {
                     self.wait(Error::Bus, |status| status & BTF != 0)?;
                     self.i2c.cr1().modify(|_, w| w.ack().clear_bit());
                 }
+                // Both last ones are held, and the clock with them, so that nothing hurries.
                 2 => {
-                    if length == 2 {
-                        self.wait(Error::Bus, |status| status & BTF != 0)?;
-                    }
+                    self.wait(Error::Bus, |status| status & BTF != 0)?;
                     if last {
                         self.stop();
                     }
@@ -295,6 +299,10 @@ const BTF: u16 = 1 << 2;
 const RXNE: u16 = 1 << 6;
 /// SR1: the next byte may be written.
 const TXE: u16 = 1 << 7;
+/// SR1: start or stop at the wrong place.
+const BERR: u16 = 1 << 8;
+/// SR1: BERR, ARLO, AF, OVR, PECERR, TIMEOUT and SMBALERT.
+const ERRORS: u16 = 0xDF00;
 
 impl ErrorType for Bus {
     type Error = Error;

@@ -467,10 +467,10 @@ mod app {
             edge |= found | core::mem::take(&mut waits);
             bound |= found;
             interrupt |= irq;
-            if pace::now() >= next_poll {
+            if pace::has_come(next_poll) {
                 (verify, poll) = (true, true);
                 next_poll += METER_POLL_MS.millis();
-                if pace::now() >= next_poll {
+                if pace::has_come(next_poll) {
                     next_poll = next_on_grid(METER_PHASE_MS);
                 }
             }
@@ -545,7 +545,7 @@ mod app {
         }
     }
 
-    /// Polls the conversion under way from shortly before its end to 1.5 of its nominal time.
+    /// Polls the conversion under way from shortly before its end to the last at which it may end.
     async fn finish(
         converter: &mut Converter,
         config: &core_logic::converter::ConverterConfig,
@@ -553,17 +553,22 @@ mod app {
     ) -> Result<Option<i16>, ConverterFault> {
         let first_ms = pace.first_ms(config.data_rate);
         pace::at_least(first_ms).await;
-        for waited_ms in first_ms..=PollPace::limit_ms(config.data_rate) {
-            let code = match converter.poll(config)? {
-                Progress::Busy => {
-                    pace::until(pace::now() + 1.millis()).await;
-                    continue;
+        let limit_ms = converter
+            .longest_ms()
+            .max(PollPace::limit_ms(config.data_rate));
+        for waited_ms in first_ms..=limit_ms {
+            match converter.poll(config)? {
+                Progress::Busy => pace::until(pace::now() + 1.millis()).await,
+                Progress::Discarded => {
+                    // Another conversion may have ended.
+                    pace.unknown();
+                    return Ok(None);
                 }
-                Progress::Discarded => None,
-                Progress::Ready(sample) => Some(sample.code),
-            };
-            pace.ended(waited_ms);
-            return Ok(code);
+                Progress::Ready(sample) => {
+                    pace.ended(waited_ms);
+                    return Ok(Some(sample.code));
+                }
+            }
         }
         pace.unknown();
         converter.on_timeout();

@@ -48,6 +48,12 @@ pub fn now() -> Millisecond {
     Mono::now()
 }
 
+/// Whether `instant` has come, as the queue sees it: the count wraps after 49.7 days, and instants compare as plain numbers, by which
+/// one before the wrap would never come after it.
+pub fn has_come(instant: Millisecond) -> bool {
+    now().as_ticks().wrapping_sub(instant.as_ticks()) < 1 << 31
+}
+
 /// Until `instant`. Not `Mono::delay_until`, an async function around the same future.
 pub fn until(instant: Millisecond) -> Delay<'static, SystickBackend> {
     queue().delay_until(instant.as_ticks())
@@ -103,7 +109,7 @@ impl Pace<'_> {
     ) -> impl Future<Output = ()> {
         let end = now() + limit_ms.millis();
         poll_fn(move |context| {
-            if work.as_mut().poll(context).is_ready() || now() >= end {
+            if work.as_mut().poll(context).is_ready() || has_come(end) {
                 Poll::Ready(())
             } else {
                 Poll::Pending

@@ -1,5 +1,6 @@
 //! The independent watchdog. It runs from its own oscillator (LSI, 17 … 47 kHz), so it also ends a start-up that waits
-//! for a crystal that does not swing; and it can never be stopped again, but by a debugger that halts the core.
+//! for a crystal that does not swing; and it can never be stopped again. Not by a debugger that halts the core, either: a core that
+//! stands at a fault because a probe catches it must not hold the permit.
 
 use stm32f4xx_hal::pac::{DBGMCU, IWDG};
 
@@ -16,8 +17,10 @@ impl Watchdog {
     /// Starts it, and waits until prescaler and reload value have reached its clock domain, five periods of LSI: a feed
     /// before that would load the reset's 4 s. The wait ends after 10 ms at the latest; the watchdog runs either way.
     pub fn start(iwdg: IWDG, debug: &DBGMCU) -> Self {
-        // A breakpoint is not to end in a reset.
-        debug.apb1_fz().modify(|_, w| w.dbg_iwdg_stop().set_bit());
+        // In an image with debug assertions a breakpoint does not end in a reset. The bit outlives resets: it is cleared as well.
+        debug
+            .apb1_fz()
+            .modify(|_, w| w.dbg_iwdg_stop().bit(cfg!(debug_assertions)));
         iwdg.kr().write(|w| w.key().start());
         iwdg.kr().write(|w| w.key().unlock());
         // LSI / 32: 1 ms at the nominal 32 kHz.

@@ -5,8 +5,9 @@
 //! decimation filter weights the middle of its window more than the ends and its notches lie elsewhere: for hum near
 //! the data rate this model is rough.
 //!
-//! The sheet does not say what a write does to a conversion under way. Here a write in continuous mode, and one that
-//! starts a single conversion, begin a new one; the output register keeps its value until that ends.
+//! What a write does to a conversion under way is taken from the sister part's sheet (ADS1110, SBAS276A, operating modes): a start
+//! has no effect on it, and what leaves the continuous mode lets it end, with the settings it began with. A part that begins anew
+//! instead is one of the errors ([`Ads1100Config::restarts`]); the output register keeps its value until a conversion ends.
 
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
@@ -33,6 +34,8 @@ const FIRST_ADDRESS: u8 = 0x48;
 pub struct Ads1100Config {
     /// Suffix of the ordering number, 0 … 7 (A0 … A7): address 0x48 + n.
     pub suffix: u8,
+    /// A write begins a new conversion in the place of one under way; off: it is ended first.
+    pub restarts: bool,
     /// Deviation of the data rate, 1 = 100 %; off: 0 (commonly quoted: ±0.2).
     pub rate_error: f64,
     /// Offset at the input, in V; off: 0.
@@ -52,6 +55,7 @@ impl Default for Ads1100Config {
     fn default() -> Self {
         Self {
             suffix: 0,
+            restarts: false,
             rate_error: 0.0,
             offset_v: 0.0,
             gain: 1.0,
@@ -260,13 +264,10 @@ impl Ads1100 {
         if byte & RESERVED != 0 {
             self.violations.record(Violation::ReservedBits, at_s);
         }
-        let was_continuous = self.configuration & SC == 0;
         self.configuration = byte & !(ST_BSY | RESERVED);
-        if self.configuration & SC == 0 || byte & ST_BSY != 0 {
+        let begins = self.configuration & SC == 0 || byte & ST_BSY != 0;
+        if begins && (self.config.restarts || self.conversion.is_none()) {
             self.begin(at_s);
-        } else if was_continuous {
-            // *Assumed*: leaving the continuous mode without a start powers down.
-            self.conversion = None;
         }
     }
 

@@ -8,6 +8,10 @@ use crate::{image, process, toolchain, workspace::Workspace};
 
 const CHIP: &str = "STM32F405RGTx";
 
+/// A reset or a fault is the firmware's to deal with: caught by the probe, the board would neither restart nor let go of its permit, and
+/// the catches outlive the session (probe-rs catches both unless it is told not to). The runner in `.cargo/config.toml` has the same.
+const LET_RUN: [&str; 2] = ["--no-catch-reset", "--no-catch-hardfault"];
+
 /// How it went.
 pub enum FlashOutcome {
     /// The board ran until the user or the firmware ended it.
@@ -40,7 +44,7 @@ pub fn run(workspace: &Workspace) -> Result<FlashOutcome> {
 
 fn stream(elf: &Path) -> Command {
     let mut command = Command::new("probe-rs");
-    command.args(["run", "--chip", CHIP]).arg(elf);
+    command.args(["run", "--chip", CHIP]).args(LET_RUN).arg(elf);
     command
 }
 

@@ -4,7 +4,7 @@ use both_flavours::both_flavours;
 
 use crate::error::{Error, Operation};
 use crate::sample::Sample;
-use crate::settings::{Address, Settings};
+use crate::settings::{Address, DataRate, Settings};
 #[cfg(feature = "async")]
 use crate::transport::Asynchronous;
 use crate::transport::Blocking;
@@ -24,8 +24,8 @@ const GENERAL_CALL_RESET: u8 = 0x06;
 pub enum Conversion {
     /// Not finished yet: poll again later.
     Busy,
-    /// Finished, but it was the first since power-up or a reset, after which the output register reads 0 as if that
-    /// were a result. Start the next one.
+    /// Finished, but the result may be another conversion's: the first since power-up or a reset, after which the output register
+    /// reads 0 as if that were a result, and the one after a start while another was under way, which goes on. Start the next one.
     Discarded,
     /// Finished; this result has not been delivered before.
     Ready(Sample),
@@ -46,6 +46,8 @@ pub(crate) struct Core<T> {
     state: State,
     /// The next single conversion is the first since power-up or a reset.
     first: bool,
+    /// When it was started another one may have been under way.
+    restarted: bool,
 }
 
 impl<T> Core<T> {
@@ -56,6 +58,7 @@ impl<T> Core<T> {
             settings,
             state: State::Idle,
             first: true,
+            restarted: false,
         }
     }
 
@@ -65,7 +68,24 @@ impl<T> Core<T> {
 
     pub(crate) fn set_settings(&mut self, settings: Settings) {
         self.settings = settings;
+        self.abandon();
+    }
+
+    /// Of the conversion under way nothing more is wanted. It goes on all the same.
+    fn abandon(&mut self) {
+        self.restarted |= self.state != State::Idle;
         self.state = State::Idle;
+    }
+
+    /// The longest that the conversion under way takes.
+    pub(crate) fn timeout_us(&self) -> u32 {
+        // The chip's own, with the settings that it comes up with, ends first.
+        let own = if self.first {
+            DataRate::default().timeout_us()
+        } else {
+            0
+        };
+        self.settings.data_rate.timeout_us().max(own)
     }
 }
 
@@ -115,8 +135,11 @@ impl<I2C: embedded_hal_async::i2c::I2c> Core<Asynchronous<I2C>> {
     }
 
     pub(crate) async fn start(&mut self) -> Result<(), Error<I2C::Error>> {
-        self.state = State::Idle;
-        self.write(ST_BSY | SC | self.settings.bits()).await?;
+        self.abandon();
+        let result = self.write(ST_BSY | SC | self.settings.bits()).await;
+        // The chip may have taken it.
+        self.restarted |= result.is_err();
+        result?;
         self.state = State::Single;
         Ok(())
     }
@@ -130,8 +153,8 @@ impl<I2C: embedded_hal_async::i2c::I2c> Core<Asynchronous<I2C>> {
             return Ok(Conversion::Busy);
         }
         self.state = State::Idle;
-        if self.first {
-            self.first = false;
+        let restarted = core::mem::take(&mut self.restarted);
+        if core::mem::take(&mut self.first) || restarted {
             return Ok(Conversion::Discarded);
         }
         self.sample(code).map(Conversion::Ready)

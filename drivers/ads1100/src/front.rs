@@ -47,6 +47,14 @@ macro_rules! local {
             pub fn set_settings(&mut self, settings: Settings) {
                 self.core.set_settings(settings);
             }
+
+            /// The longest that a single conversion takes from its start, in µs:
+            /// [`DataRate::timeout_us`](crate::DataRate::timeout_us), and after power-up or a reset that of the rate which the chip then
+            /// converts at.
+            #[must_use]
+            pub fn timeout_us(&self) -> u32 {
+                self.core.timeout_us()
+            }
         }
     };
 }
@@ -80,7 +88,8 @@ macro_rules! methods {
 }
 
 methods! {
-    /// Starts a single conversion; one under way is started anew.
+    /// Starts a single conversion. One under way goes on instead (ADS1110 data sheet SBAS276A, operating modes; that of the ADS1100 is
+    /// silent): what comes next is [`Conversion::Discarded`].
     ///
     /// # Errors
     /// [`Error::Bus`]: no conversion counts as under way.
@@ -88,8 +97,8 @@ methods! {
 
     /// Reads code and configuration, and delivers the result once the conversion has finished.
     ///
-    /// Each result is delivered once, so what comes out is always new. A conversion still [`Conversion::Busy`] after
-    /// [`DataRate::timeout_us`](crate::DataRate::timeout_us) is a fault.
+    /// Each result is delivered once, so what comes out is always new. A conversion still [`Conversion::Busy`] after `timeout_us` is a
+    /// fault.
     ///
     /// # Errors
     /// [`Error::NotStarted`]; [`Error::ConfigurationLost`] after a reset, a brown-out, or on a stuck bus;

@@ -75,6 +75,9 @@ impl Outside for World {
         }
         answer
     }
+    fn i2c_spurious_bus_error(&mut self) -> bool {
+        self.bus.take_spurious_bus_error()
+    }
     fn i2c_lines(&mut self, at: Ticks) -> (bool, bool) {
         self.bus.lines(at)
     }

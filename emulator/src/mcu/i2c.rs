@@ -434,7 +434,12 @@ impl I2c {
                 *end = (*end).max(context.now) + clock.bits(1);
                 None
             }
-            answer => Some(answer),
+            answer => {
+                if context.outside.i2c_spurious_bus_error() {
+                    self.sr1 |= BERR;
+                }
+                Some(answer)
+            }
         }
     }
 
@@ -1353,6 +1358,21 @@ mod tests {
         bench.write(SR1, 0);
         set(&mut bench, STOP);
         until_free(&mut bench, micro());
+    }
+
+    #[test]
+    fn a_spurious_bus_error_changes_nothing_else() {
+        let mut bench = fast();
+        bench.world.bus.inject(I2cFault::SpuriousBusErrors(2));
+        set(&mut bench, START);
+        wait(&mut bench, SB, micro());
+        assert_eq!(sr1(&bench), SB | BERR);
+        bench.write(DR, 0x90);
+        bench.run(BYTE);
+        assert_eq!(sr1(&bench), ADDR | TXE | BERR);
+        // Writing 0 clears it, and nothing else.
+        bench.write(SR1, 0);
+        assert_eq!(sr1(&bench), ADDR | TXE);
     }
 
     #[test]

@@ -32,6 +32,10 @@ const BASE: u32 = 0x4000_0000;
 const TIM4_CHANNEL_1: u8 = 2;
 /// Bit rate of the vehicle's bus.
 const CAN_BIT_RATE: u32 = 500_000;
+/// Up to here a pad of any speed brings SPI's clock back in time. *Assumed*: the errata sheet's table was not at hand.
+const SLOW_APB_HZ: u32 = 25_000_000;
+/// Beyond, the pad has to be one for this and more: high or very high speed.
+const FEEDBACK_HZ: u64 = 50_000_000;
 
 /// An access that ends the run.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -240,7 +244,10 @@ impl State {
         }
     }
 
-    /// Clock and data of an SPI master that sends have to be able to follow its clock: real pins would round the edges off.
+    /// Clock and data of an SPI master that sends have to be able to follow its clock: real pins would round the edges off. And the
+    /// clock's pad has to be fast against the clock of the APB, however slow the SPI is: what is received is strobed by what comes back
+    /// through that pad, and if it comes late the last bit is the one of the byte before (errata ES0182, corrupted last bit of data
+    /// received in master mode with delayed SCK feedback).
     fn check_edges(&self, block: Block) -> Result<(), Unmodelled> {
         let (spi, clock, port, pins) = if block == Block::Spi1 {
             (&self.spi1, self.clocks.apb2, 'A', [5, 7])
@@ -248,6 +255,17 @@ impl State {
             (&self.spi2, self.clocks.apb1, 'B', [13, 15])
         };
         let clock_hz = u64::from(clock) / spi.divider();
+        let feedback_hz = self.gpio.fastest_hz(Pin::new(port, pins[0]));
+        if clock > SLOW_APB_HZ && feedback_hz < FEEDBACK_HZ {
+            return Err(Unmodelled {
+                register: format!("GPIO{port}_OSPEEDR"),
+                what: format!(
+                    "SCK of {block:?} on pin {} at an output speed for {feedback_hz} Hz: with {clock} Hz on its APB the last bit of a \
+                     received byte may be wrong, expected high or very high speed",
+                    pins[0]
+                ),
+            });
+        }
         for pin in pins {
             let fastest_hz = self.gpio.fastest_hz(Pin::new(port, pin));
             if clock_hz > fastest_hz {

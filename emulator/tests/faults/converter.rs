@@ -154,11 +154,12 @@ fn fault_f13_repeated_samples_count_once_and_only_stuck_ones_are_called_so() {
         assert_eq!(unexpected(&rig, &[]), Vec::<&str>::new(), "{rate_error}");
     }
 
-    let rows = vec![row(0.0), row(1.5), row(3.5).with_current(40.0)];
+    // The run of equal codes is as long as to have a mean of the meter's before the current moves.
+    let rows = vec![row(0.0), row(2.5), row(4.5).with_current(40.0)];
     let mut rig = rig_of(Setup::nominal(
         Scenario::new(rows, Contactors::AlwaysClosed).unwrap(),
     ));
-    rig.run_s(1.5).unwrap();
+    rig.run_s(2.5).unwrap();
     strike(&mut rig, "F13:5s");
     let found_s = until_diagnosis(&mut rig, "ConverterStuck", 3.0);
     println!(
@@ -168,4 +169,36 @@ fn fault_f13_repeated_samples_count_once_and_only_stuck_ones_are_called_so() {
     // 32 repeats are one second.
     assert!(found_s <= 1.3, "{found_s}");
     assert_eq!(rig.view.current_a().valid(), None);
+}
+
+#[test]
+fn fault_f11_a_bus_error_that_is_none_costs_no_conversion() {
+    let mut rig = steady(40.0);
+    rig.run_s(0.5).unwrap();
+    let counters_before = counters(&mut rig, 0x0110, 2);
+    let before = conversions(&rig);
+    rig.run_s(0.5).unwrap();
+    let undisturbed = conversions(&rig) - before;
+    let before = conversions(&rig);
+    // In starts, addresses, data and stops: wherever one of the events ends.
+    let mut struck = 0;
+    watch(&mut rig, 0.5, |rig| {
+        strike(rig, "F11:spurious");
+        struck += 1;
+        assert!(
+            rig.view
+                .current_a()
+                .valid()
+                .is_some_and(|a| (a - 40.0).abs() < 0.1)
+        );
+    });
+    let disturbed = conversions(&rig) - before;
+    println!("F11 spurious: {struck} struck, {disturbed} conversions, {undisturbed} without");
+    assert!(struck > 100, "{struck}");
+    assert!(
+        (disturbed - undisturbed).abs() <= 1.0,
+        "{disturbed} of {undisturbed}"
+    );
+    assert_eq!(counters(&mut rig, 0x0110, 2), counters_before);
+    assert_eq!(unexpected(&rig, &[]), Vec::<&str>::new());
 }

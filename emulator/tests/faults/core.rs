@@ -3,8 +3,9 @@
 use core_logic::range::Range;
 use emulator::faults::{Factor, configurations_in_ram, factors_in_ram};
 use emulator::mcu::rcc::ResetCause;
-use emulator::rig::Setup;
+use emulator::rig::{Rig, Setup};
 use emulator::scenario::{Contactors, Scenario};
+use emulator::time::Ticks;
 
 use crate::bench::*;
 
@@ -163,6 +164,57 @@ fn fault_f23_the_wrap_of_the_microsecond_counter_is_not_seen() {
         // It went on: 1.4 s and the request after the wrap.
         assert_eq!(u64::from(uptime), (wrap + 1_420_000) / 1_000_000);
         assert_eq!(resets(&rig), 0);
+    }
+}
+
+#[test]
+fn fault_f23_the_wrap_of_the_millisecond_clock_is_not_seen() {
+    let ticks = firmware().image.symbol("SYSTICK_CNT").unwrap();
+    // As it goes, and with whatever is due in the last millisecond done after the wrap only.
+    for late in [false, true] {
+        let rows = vec![
+            row(0.0),
+            row(1.0),
+            row(1.01).with_current(40.0),
+            row(4.0).with_current(40.0),
+            row(4.01),
+        ];
+        let mut rig = rig_of(Setup::nominal(
+            Scenario::new(rows, Contactors::AlwaysClosed).unwrap(),
+        ));
+        // Between the zeroing of memory, which comes up with a pattern, and the clock's start.
+        let count = |rig: &Rig<'_>| rig.machine.ram_word(ticks).unwrap();
+        while count(&rig) != 0 {
+            rig.run_for(Ticks::from_micros(1)).unwrap();
+        }
+        rig.machine.set_ram_word(ticks, u32::MAX - 3_000);
+        rig.run_s(SETTLED_S).unwrap();
+        assert!(count(&rig) > u32::MAX - 3_000, "the clock was started anew");
+        rig.view.diagnoses.clear();
+        rig.view.restart_periods();
+        let before = charges_c(&mut rig);
+        while count(&rig) < u32::MAX - 1 {
+            rig.run_for(Ticks::from_micros(20)).unwrap();
+        }
+        if late {
+            rig.machine.set_ram_word(ticks, 0);
+        }
+        rig.run_s(2.0).unwrap();
+        assert!(count(&rig) < 3_000);
+        let error_c = charge_error_c(&mut rig, before);
+        let period = rig.view.period("Current");
+        println!(
+            "F23 2^32 ms, late {late}: charge error {:.1} mC of 120 C, frames {:.2} … {:.2} ms apart, {:?}, {} resets",
+            error_c * 1e3,
+            period.shortest_s * 1e3,
+            period.longest_s * 1e3,
+            unexpected(&rig, &[]),
+            resets(&rig)
+        );
+        assert_eq!(resets(&rig), 0);
+        assert!(error_c.abs() <= quantum_c(Range::Small), "{error_c}");
+        assert!(period.longest_s <= 0.0125 && period.shortest_s >= 0.0075);
+        assert_eq!(unexpected(&rig, &[]), Vec::<&str>::new());
     }
 }
 
