@@ -51,6 +51,7 @@ use course::{Answer, Course};
 use fit::Fit;
 use flexible::{Explainable, Features};
 use select::{Named, Selection};
+pub use strays::{RARE, STRAY};
 use strays::{name_by_place, slips};
 use told::{
     attribute, base_found, behind_ends, current_off, effects, fitted, plots, sentence, short,

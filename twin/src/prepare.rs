@@ -12,6 +12,7 @@ mod frame;
 mod held;
 mod phase;
 mod series;
+mod slips;
 mod stairs;
 mod start;
 
@@ -190,6 +191,9 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
     for item in &mut items {
         model_effects(model, item)?;
         if purpose.compares() {
+            if let Some(remark) = slips::leave_out(&mut item.problem) {
+                work.remark(remark);
+            }
             checks::enough(&item.problem, frame.source())?;
         }
     }

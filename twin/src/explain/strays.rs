@@ -10,9 +10,9 @@ use crate::effects::Effect;
 use crate::report::data::Verdict;
 
 /// Times the stated noise that noise never is.
-pub(super) const STRAY: f64 = 8.0;
+pub const STRAY: f64 = 8.0;
 /// Up to this share of the readings they are rare.
-const RARE: f64 = 0.01;
+pub const RARE: f64 = 0.01;
 /// What would be so by chance less often than this is not chance, …
 const BY_CHANCE: f64 = 0.05;
 /// … and than this, it is worth a name.

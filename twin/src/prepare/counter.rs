@@ -6,6 +6,7 @@
 
 use crate::{
     problem::{Drive, Series},
+    range::range,
     report::format::at_most,
 };
 
@@ -13,12 +14,16 @@ use crate::{
 const CHANNELS: f64 = 0.002;
 /// A step whose mean is known to this standard uncertainty, as a share of the way between its ends, tells something.
 const TELLS: f64 = 0.2;
-/// Standard deviations beyond the ends of a step from which the counter did not count that current: it was reset.
+/// Standard deviations beyond the ends of a step from which the counter did not count that current alone.
 const RESET: f64 = 3.0;
 /// The counter belongs to the current if it counted so many of the steps that tell something.
 const COUNTED: f64 = 0.5;
 /// Variance of a share that may be anything from 0 to 1: what is known before the counter is asked.
 const ANYTHING: f64 = 1.0 / 12.0;
+/// Share of the steps that tell how the counter scatters: those in which the current changes least.
+const STILL: f64 = 0.25;
+/// Rows for which a steady current stays: a drive does not by chance.
+const WHILE: usize = 10;
 /// Decimal digits behind the point up to which a counter may round.
 const DIGITS: i32 = 9;
 /// Standard deviations in a median of absolute values.
@@ -41,21 +46,38 @@ pub(super) fn between_rows(drive: &Drive, ah: &[f64]) -> Option<Told> {
         .filter_map(|row| Step::new(drive, ah, row))
         .collect();
     let noise_ah = noise_ah(&steps, ah)?;
+    let [lowest_a, highest_a] = range(drive.reference.iter().copied())?;
+    let is_reset = |step: &Step, sigma: f64| {
+        let mean_a = step.counted_ah / step.hours;
+        let wide_a = RESET * noise_ah / step.hours;
+        // What it counted is more than any current of the recording, or less; or it is right from zero on, and only so.
+        !(lowest_a - wide_a..=highest_a + wide_a).contains(&mean_a)
+            || (!step.fits(step.counted_ah, sigma) && step.fits(ah[step.row], sigma))
+    };
+    let steady = steady(drive, CHANNELS * lowest_a.abs().max(highest_a.abs()));
     let mut mean_share = vec![0.5; drive.len()];
     let (mut telling, mut counted, mut most_ah, mut all_ah) = (0usize, 0usize, 0.0f64, 0.0);
+    // What the counter has counted and the current between its rows has not yet: the counter does not forget, and a step that has to
+    // stay between its ends, or tells little by itself, leaves the rest to the next ones. Else the errors of straight lines, which make up
+    // for one another, were corrected in some steps and not in others. Where the current is steady there is nothing between its rows: what
+    // the counter says there is how the two channels differ.
+    let mut left_ah = 0.0f64;
     for step in &steps {
-        let sigma = noise_ah.hypot(CHANNELS * step.from_ah) / step.change_ah.abs();
-        let share = (step.counted_ah - step.from_ah) / step.change_ah;
+        let sigma = step.sigma(noise_ah);
         let tells = sigma < TELLS;
         telling += usize::from(tells);
-        if !sigma.is_finite() || share < -RESET * sigma || share > 1.0 + RESET * sigma {
+        counted += usize::from(tells && step.fits(step.counted_ah, sigma));
+        if steady[step.row] || is_reset(step, sigma) {
             continue;
         }
-        counted += usize::from(tells);
+        left_ah += step.counted_ah - step.from_ah;
+        let share = left_ah / step.change_ah;
         // The mean of what is known before and of what the counter says, each with the weight of its variance.
         let (before, told) = (1.0 / ANYTHING, 1.0 / (sigma * sigma));
         let known = ((0.5 * before + share * told) / (before + told)).clamp(0.0, 1.0);
+        let known = if known.is_finite() { known } else { 0.5 };
         mean_share[step.row] = known;
+        left_ah -= known * step.change_ah;
         let off_ah = (0.5 - known) * step.change_ah;
         most_ah = most_ah.max(off_ah.abs());
         all_ah += off_ah;
@@ -74,10 +96,39 @@ pub(super) fn between_rows(drive: &Drive, ah: &[f64]) -> Option<Told> {
     })
 }
 
+/// Rows that end a step in which the current stays where it is, to `within_a` either way, for a while.
+fn steady(drive: &Drive, within_a: f64) -> Vec<bool> {
+    let mut steady = vec![false; drive.len()];
+    for rows in &drive.segments {
+        let mut begin = rows.start;
+        while begin < rows.end {
+            let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
+            let stays = rows.end.min(
+                begin
+                    + drive.reference[begin..rows.end]
+                        .iter()
+                        .take_while(|i| {
+                            (low, high) = (low.min(**i), high.max(**i));
+                            high - low <= 2.0 * within_a
+                        })
+                        .count(),
+            );
+            if stays - begin >= WHILE {
+                steady[begin + 1..stays].fill(true);
+                begin = stays - 1;
+            }
+            begin += 1;
+        }
+    }
+    steady
+}
+
 /// A step of the current, in Ah over it.
 struct Step {
     /// The row where it ends.
     row: usize,
+    /// Its length in h.
+    hours: f64,
     /// What the counter says.
     counted_ah: f64,
     /// What the current of the row where it begins comes to.
@@ -94,19 +145,40 @@ impl Step {
         let counted_ah = ah[row] - ah[row - 1];
         (hours > 0.0 && counted_ah.is_finite()).then_some(Self {
             row,
+            hours,
             counted_ah,
             from_ah: from * hours,
             change_ah: (to - from) * hours,
         })
     }
+
+    /// What a straight line comes to.
+    fn straight_ah(&self) -> f64 {
+        self.from_ah + 0.5 * self.change_ah
+    }
+
+    /// Standard uncertainty of where the counter says that the mean lies, as a share of the way between the ends. The same whether the
+    /// current goes up that way or down.
+    fn sigma(&self, noise_ah: f64) -> f64 {
+        noise_ah.hypot(CHANNELS * self.straight_ah()) / self.change_ah.abs()
+    }
+
+    /// Whether a charge is one of this step: its mean is between the ends.
+    fn fits(&self, charge_ah: f64, sigma: f64) -> bool {
+        let share = (charge_ah - self.from_ah) / self.change_ah;
+        (-RESET * sigma..=1.0 + RESET * sigma).contains(&share)
+    }
 }
 
 /// Standard deviation of what the counter says of one step: rounding of the two readings, or more if it scatters more about straight
-/// lines.
+/// lines where the current hardly changes.
 fn noise_ah(steps: &[Step], ah: &[f64]) -> Option<f64> {
+    let mut changes: Vec<f64> = steps.iter().map(|step| step.change_ah.abs()).collect();
+    let even_ah = super::series::quantile(&mut changes, STILL)?;
     let mut off: Vec<f64> = steps
         .iter()
-        .map(|step| (step.counted_ah - step.from_ah - 0.5 * step.change_ah).abs())
+        .filter(|step| step.change_ah.abs() <= even_ah)
+        .map(|step| (step.counted_ah - step.straight_ah()).abs())
         .collect();
     let scatter = OF_MEDIAN * super::series::median(&mut off)?;
     // Each of two readings is off by up to half a digit, evenly: variance 1/12 of its square each.
@@ -178,6 +250,83 @@ mod tests {
             drive.mean_share = Some(told.mean_share);
             let counted = drive.charge()[drive.len() - 1] / 3600.0;
             assert!((counted - flowed).abs() < 0.05, "{counted} Ah of {flowed}");
+        }
+    }
+
+    /// A drive of some seconds a row with a counter of what really flowed, in digits of a size.
+    fn driven(
+        row_s: usize,
+        shows: fn(&[f64]) -> f64,
+        digit: f64,
+        drift: f64,
+    ) -> (Drive, Vec<f64>, Vec<f64>) {
+        // Fast up and slowly down, charge between.
+        let current = |s: usize| {
+            let t = s as f64;
+            let burst = 30.0 * (1.0 - (t % 23.0) / 23.0).powi(3) - 12.0 * f64::from(s % 61 > 50);
+            burst + 5.0 * (t / 7.0).sin() + 2.0 * (t * t * 0.37).sin()
+        };
+        let fine: Vec<f64> = (0..=7200).map(current).collect();
+        let rows: Vec<usize> = (0..fine.len() / row_s).map(|row| row * row_s).collect();
+        let sums: Vec<f64> = std::iter::once(0.0)
+            .chain(fine.iter().scan(0.0, |sum, i| {
+                *sum += i / 3600.0;
+                Some(*sum)
+            }))
+            .collect();
+        let flowed: Vec<f64> = rows.iter().map(|s| sums[*s + 1] - sums[1]).collect();
+        let ah = flowed
+            .iter()
+            .map(|ah| ((1.0 + drift) * ah / digit).round() * digit);
+        let reference: Vec<f64> = rows
+            .iter()
+            .map(|s| shows(&fine[s.saturating_sub(row_s - 1)..=*s]))
+            .collect();
+        let t_s: Vec<f64> = rows.iter().map(|s| *s as f64).collect();
+        let ah: Vec<f64> = ah.collect();
+        let drive = Drive {
+            segments: std::iter::once(0..t_s.len()).collect(),
+            continues: vec![false],
+            t_s: t_s.into(),
+            reference: reference.into(),
+            ..Drive::default()
+        };
+        (drive, ah, flowed)
+    }
+
+    /// Whatever the rows show of the current: errors of straight lines make up for one another, and so must what is left of them.
+    #[test]
+    fn no_charge_is_made_by_steps_that_tell_more_than_others() {
+        let mean: fn(&[f64]) -> f64 = |i| i.iter().sum::<f64>() / i.len() as f64;
+        let last: fn(&[f64]) -> f64 = |i| i[i.len() - 1];
+        for row_s in [1, 2, 5, 10] {
+            for (name, shows) in [("mean", mean), ("last", last)] {
+                for digit in [1e-8, 1e-5, 1e-3] {
+                    for drift in [0.0, 0.001] {
+                        let (mut drive, ah, flowed) = driven(row_s, shows, digit, drift);
+                        let Some(told) = between_rows(&drive, &ah) else {
+                            continue;
+                        };
+                        let largest_ah = 30.0 * row_s as f64 / 3600.0;
+                        let off = |drive: &Drive| -> f64 {
+                            let charge = drive.charge();
+                            let off = charge.iter().zip(&flowed);
+                            off.map(|(charge, flowed)| (charge / 3600.0 - flowed).abs())
+                                .fold(0.0, f64::max)
+                        };
+                        let straight = off(&drive);
+                        drive.mean_share = Some(told.mean_share);
+                        let with = off(&drive);
+                        println!(
+                            "{name} of {row_s} s, {digit} Ah, {drift}: {straight:.5} -> {with:.5} Ah"
+                        );
+                        // What may be left: a step that waits for the next, and what the two channels differ by.
+                        let all_ah = flowed.iter().fold(0.0f64, |most, ah| most.max(ah.abs()));
+                        let most = largest_ah + 3.0 * digit + 2.0 * drift * all_ah;
+                        assert!(with <= most, "{with} Ah, {most} Ah");
+                    }
+                }
+            }
         }
     }
 

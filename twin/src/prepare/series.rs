@@ -194,6 +194,13 @@ pub(super) fn spacing_s(observed: &Observed) -> f64 {
     median(&mut steps).unwrap_or(0.0)
 }
 
+/// The value below which a share of some lies; `None` of none.
+pub fn quantile(values: &mut [f64], share: f64) -> Option<f64> {
+    let last = values.len().checked_sub(1)?;
+    let at = (share * last as f64) as usize;
+    Some(*values.select_nth_unstable_by(at, f64::total_cmp).1)
+}
+
 /// The middle one.
 pub(super) fn median(values: &mut [f64]) -> Option<f64> {
     if values.is_empty() {
