@@ -141,6 +141,9 @@ mod tests {
 
     const NOISE_A: f64 = 0.1;
 
+    /// What a sensor makes of a current in a row.
+    type Reads = dyn Fn(usize, &[f64]) -> f64;
+
     /// Steps and waves, and a reading of them that is one percent too large, by noise of even spread, and with something in it.
     fn problem(rows: u32, of_row: impl Fn(usize, &[f64]) -> f64) -> Problem {
         let t_s: Vec<f64> = (0..rows).map(|row| 0.1 * f64::from(row)).collect();
@@ -184,7 +187,7 @@ mod tests {
     #[test]
     fn what_is_physics_of_the_sensor_is_no_slip() {
         // Nothing; late by a row; the mean of two; a reading that is held; now and then something for two rows; a step in 1 of 50.
-        let cases: [&dyn Fn(usize, &[f64]) -> f64; 6] = [
+        let cases: [&Reads; 6] = [
             &|at, i| i[at],
             &|at, i| i[at.saturating_sub(1)],
             &|at, i| 0.5 * (i[at] + i[at.saturating_sub(1)]),
