@@ -181,6 +181,24 @@ impl BusView {
         self.reading("StateOfCharge", "StateOfCharge", "StateOfChargeValidity")
     }
 
+    /// Supply of the sensors, in V.
+    pub fn supply_v(&self) -> Reading {
+        let reading = self.reading("Environment", "SensorSupply", "SensorSupplyValidity");
+        Reading {
+            value: reading.value.map(|mv| mv / 1e3),
+            ..reading
+        }
+    }
+
+    /// Temperature at the sensors, in °C.
+    pub fn sensor_c(&self) -> Reading {
+        self.reading(
+            "Environment",
+            "SensorTemperature",
+            "SensorTemperatureValidity",
+        )
+    }
+
     /// When the newest frame of a message ended.
     pub fn last_at(&self, message: &str) -> Option<Ticks> {
         let message = MESSAGES

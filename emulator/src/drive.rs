@@ -616,7 +616,8 @@ impl Sink {
         self.row(at_s, &before, converted)
     }
 
-    /// A row of the recording, with what is new in it.
+    /// A row of the recording, with what is new in it. What the board marks as not valid is missing, as `twin convert` leaves
+    /// it out.
     fn row(&mut self, at_s: f64, news: &News, converted: bool) -> Result<()> {
         let Some(sample) = self.samples.front() else {
             return Ok(());
@@ -638,17 +639,10 @@ impl Sink {
             between(sample.current_a, next.current_a),
             new(converted, view.current_a().valid()),
             between(sample.charge_c, next.charge_c),
-            new(news.charge, view.charge_c().value),
+            new(news.charge, view.charge_c().valid()),
             new(true, view.signal("Current", "CurrentRange")),
-            new(
-                news.environment,
-                view.signal("Environment", "SensorSupply")
-                    .map(|mv| mv / 1e3),
-            ),
-            new(
-                news.environment,
-                view.signal("Environment", "SensorTemperature"),
-            ),
+            new(news.environment, view.supply_v().valid()),
+            new(news.environment, view.sensor_c().valid()),
             sample.row.aux_current_a,
             new(true, sample.row.cell_v),
             new(news.soc, view.soc_pct().valid()),

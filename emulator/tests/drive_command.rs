@@ -4,6 +4,7 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+use std::collections::HashMap;
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -12,7 +13,11 @@ use std::time::Duration;
 
 use emulator::image::FLASH_START;
 use emulator::rig::default_image;
-use recording::csv;
+use recording::{
+    convert::{self, Options},
+    csv,
+    dbc::Database,
+};
 use serde_json::Value;
 
 fn emulate(folder: &Path, arguments: &[&str]) -> Output {
@@ -386,6 +391,8 @@ fn a_drive_is_written_down_as_it_was() {
         assert!(!read || sent.contains(at_s), "{at_s}");
     }
 
+    compare_with_the_bus(&out, &board);
+
     // --check says by its exit code what the summary says in words.
     let checked = run("checked", &["--check"]);
     let complaints = report["complaints"].as_array().unwrap();
@@ -399,6 +406,55 @@ fn a_drive_is_written_down_as_it_was() {
             "{name}"
         );
     }
+}
+
+/// `board.csv` has what `twin convert` makes of `can.log`, and nothing where that has nothing.
+fn compare_with_the_bus(out: &Path, board: &recording::Recording) {
+    let database = Path::new(env!("CARGO_MANIFEST_DIR")).join("../can/board.dbc");
+    let options = Options {
+        database: Some(Database::read(&database).unwrap()),
+        ..Options::default()
+    };
+    let log = out.join("can.log");
+    let converted = convert::read(&log, &options, &mut |_| {}).unwrap();
+    let (_, decoded) = converted.counts.unwrap();
+    assert_eq!(decoded.broken, 0);
+    // Conversions that a range change fell into.
+    assert!(decoded.invalid > 0);
+    let path = out.join("bus.csv");
+    convert::write(&path, converted.columns(), &mut |_| {}).unwrap();
+    let bus = csv::read(&path).unwrap();
+    // The log's times count from its first frame, in µs.
+    let first = fs::read_to_string(&log).unwrap();
+    let from_s: f64 = first[1..first.find(')').unwrap()].parse().unwrap();
+    let micros = |t_s: f64| (t_s * 1e6).round() as i64;
+    let told: HashMap<i64, usize> = (0..board.len())
+        .map(|row| (micros(board.time_s()[row] - from_s), row))
+        .collect();
+    let column = |name: &str| bus.need(name).unwrap();
+    let same = |name: &str, row: usize, at: usize| {
+        let (ours, bus) = (board.need(name).unwrap()[at], column(name)[row]);
+        let same = ours == bus || ours.is_nan() && bus.is_nan();
+        assert!(same, "{name} in row {row} of the bus: {ours}, {bus}");
+    };
+    let (mut conversion, mut values, mut blanks) = (f64::NAN, 0, 0);
+    for row in 0..bus.len() {
+        let at = told.get(&micros(bus.time_s()[row])).copied();
+        let number = column("Current.CurrentConversions")[row];
+        // The first row of each conversion.
+        if number.is_finite() && std::mem::replace(&mut conversion, number) != number {
+            same("i_meas_a", row, at.unwrap());
+            if column("i_meas_a")[row].is_finite() {
+                values += 1;
+            } else {
+                blanks += 1;
+            }
+        }
+        if column("Charge.ChargeValidity")[row].is_finite() {
+            same("q_meas_c", row, at.unwrap());
+        }
+    }
+    assert!(values > 50 && blanks > 2, "{values}, {blanks}");
 }
 
 #[test]

@@ -4,7 +4,8 @@
 
 For each log of CAN frames there is NAME.expected.csv: one line a value, "frame,t_s,column,value", where frame counts the
 data frames, t_s counts from the first of them, and column and unit follow this project's rule: <Message>.<Signal> and
-the unit's ending. Values come from cantools. For each measurement file there is NAME.expected.csv, "group,t_s,column,value".
+the unit's ending. Values come from cantools; of the board's, those that it marks as not valid are left out, and frames
+whose end-to-end check fails. For each measurement file there is NAME.expected.csv, "group,t_s,column,value".
 """
 
 import csv
@@ -56,6 +57,45 @@ CANONICAL = {
     "BatteryVoltage.CellTemperature": "temp_cell_c",
 }
 MISSING = {"not available", "sna"}
+# The signal with the causes against another of the board's: its name and this.
+VALIDITY = "Validity"
+
+
+def crc_of(data_id, payload):
+    """AUTOSAR E2E profile 11: over the data ID's low byte, a zero byte and all bytes but the first."""
+    crc = 0
+    for byte in [data_id & 0xFF, 0, *payload[1:]]:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc << 1 ^ (0x11D if crc & 0x80 else 0)
+    return crc
+
+
+def data_id_of(message):
+    attributes = message.dbc.attributes if message.dbc else {}
+    profile = attributes.get("E2EProfile")
+    return attributes["E2EDataId"].value if profile and profile.value == "P11C" else None
+
+
+def is_whole(message, payload):
+    data_id = data_id_of(message)
+    if data_id is None:
+        return True
+    return payload[0] == crc_of(data_id, payload) and payload[1] >> 4 == data_id >> 8 and payload[1] & 0x0F != 15
+
+
+def as_the_board_sends(message, payload, rng):
+    """Nothing against half of the values, and of ten protected frames nine that are whole."""
+    payload = bytearray(payload)
+    for signal in message.signals:
+        if signal.name.endswith(VALIDITY) and rng.random() < 0.5:
+            for bit in range(signal.start, signal.start + signal.length):
+                payload[bit // 8] &= ~(1 << bit % 8)
+    data_id = data_id_of(message)
+    if data_id is not None and rng.random() < 0.9:
+        payload[1] = data_id >> 8 << 4 | rng.randrange(15)
+        payload[0] = crc_of(data_id, payload)
+    return bytes(payload)
 
 
 def random_frames(database, rng):
@@ -102,7 +142,7 @@ def random_data(message, rng):
         return rng.randbytes(5) + b"\xff\xff" + rng.randbytes(1)
     if message.name == "Pack" and rng.random() < 0.2:
         return rng.randbytes(2) + b"\x00\x80" + rng.randbytes(4)
-    return rng.randbytes(message.length)
+    return as_the_board_sends(message, rng.randbytes(message.length), rng)
 
 
 def column_of(database_name, message, signal):
@@ -123,12 +163,16 @@ def write_expected(path, name, database, frames):
                 message = database.get_message_by_frame_id(frame.arbitration_id, frame.is_extended_id)
             except KeyError:
                 continue
+            if not is_whole(message, frame.data):
+                continue
             physical = message.decode(bytes(frame.data), decode_choices=False)
             raws = message.decode(bytes(frame.data), decode_choices=False, scaling=False)
             for signal in message.signals:
                 if signal.name not in physical:
                     continue
                 value, raw = physical[signal.name], raws[signal.name]
+                if name == "board" and raws.get(signal.name + VALIDITY, 0) != 0:
+                    continue
                 choice = (signal.choices or {}).get(raw)
                 if choice is not None and str(choice).lower() in MISSING:
                     continue

@@ -1,7 +1,9 @@
 //! Frames decoded by a DBC.
 //!
 //! A signal becomes the column `<Message>.<Signal>` and its unit's ending, in our unit; signals of this project's own
-//! board get the names of [`name`](crate::name). A value that the database calls "not available" is a missing one.
+//! board get the names of [`name`](crate::name). A value that the database calls "not available" is a missing one. So is,
+//! by the board's database, one against which the signal of its name and `Validity` in the same frame has any cause; a
+//! frame that its end-to-end check does not let pass is left out.
 
 use std::{
     collections::{BTreeSet, HashMap},
@@ -10,13 +12,14 @@ use std::{
 };
 
 use can_dbc::{
-    ByteOrder, Dbc, DbcError, MessageId, MultiplexIndicator, SignalExtendedValueType,
-    ValueDescription, ValueType,
+    AttributeValue, ByteOrder, Dbc, DbcError, MessageId, MultiplexIndicator,
+    SignalExtendedValueType, ValueDescription, ValueType,
 };
 
 use crate::{
+    e2e,
     error::{Error, Kind, Place, Result, listed, quoted},
-    log::{DATA_BYTES, Frame},
+    log::{CLASSIC_BYTES, DATA_BYTES, Frame},
     merge::{Series, Signal},
     unit::{self, Scale, Unit},
 };
@@ -41,6 +44,14 @@ const BOARD_COLUMNS: [(&str, &str, &str); 9] = [
     ("BatteryVoltage", "CellTemperature", "temp_cell_c"),
 ];
 
+/// What the board's database calls the signal with the causes against another: the other's name and this.
+const VALIDITY: &str = "Validity";
+
+/// Attributes of the board's protected messages, and the profile that is checked: AUTOSAR E2E profile 11, variant C.
+const E2E_PROFILE: &str = "E2EProfile";
+const E2E_DATA_ID: &str = "E2EDataId";
+const PROFILE_11C: &str = "P11C";
+
 /// What databases call the raw value of a signal that has none.
 const NOT_AVAILABLE: [&str; 3] = ["not available", "signal not available", "sna"];
 
@@ -53,6 +64,8 @@ pub struct Database {
 #[derive(Clone, Debug)]
 struct Message {
     signals: Vec<Coded>,
+    /// Of a message that is protected end to end.
+    data_id: Option<u16>,
 }
 
 /// How a signal is coded.
@@ -66,6 +79,8 @@ struct Coded {
     factor: Scale,
     offset: f64,
     missing: Option<i64>,
+    /// The signal with the causes against this one, by its place in the message.
+    validity: Option<usize>,
     /// The multiplexer (by its place in the message) and the values of it for which this signal is there.
     switch: Option<(usize, Vec<(u64, u64)>)>,
 }
@@ -179,6 +194,11 @@ impl Database {
                         "a multiplexer in the same message",
                     )
                 })?;
+                let validity = format!("{}{VALIDITY}", signal.name);
+                let validity = message
+                    .signals
+                    .iter()
+                    .position(|other| board && other.name == validity);
                 let unit = unit::known(&signal.unit);
                 let canonical = BOARD_COLUMNS
                     .iter()
@@ -200,6 +220,7 @@ impl Database {
                     factor: Scale::of(signal.factor, unit),
                     offset: unit.map_or(signal.offset, |unit| unit.scale.apply(signal.offset)),
                     missing: missing(dbc, message.id, &signal.name),
+                    validity,
                     switch,
                 });
             }
@@ -210,7 +231,8 @@ impl Database {
                     "a chain of multiplexers with an end",
                 ));
             }
-            messages.insert(message.id, Message { signals });
+            let data_id = data_id(dbc, message.id).filter(|_| board);
+            messages.insert(message.id, Message { signals, data_id });
         }
         Ok(Self { messages })
     }
@@ -262,6 +284,19 @@ fn missing(dbc: &Dbc, id: MessageId, signal: &str) -> Option<i64> {
                 .any(|known| text.eq_ignore_ascii_case(known))
         })
         .map(|value| value.id)
+}
+
+/// The data ID of a message that is protected by the profile that is checked here.
+fn data_id(dbc: &Dbc, id: MessageId) -> Option<u16> {
+    let profile = dbc.message_attribute(id, E2E_PROFILE)?;
+    if !matches!(profile, AttributeValue::String(name) if name == PROFILE_11C) {
+        return None;
+    }
+    match *dbc.message_attribute(id, E2E_DATA_ID)? {
+        AttributeValue::Uint(number) => u16::try_from(number).ok(),
+        AttributeValue::Int(number) => u16::try_from(number).ok(),
+        _ => None,
+    }
 }
 
 type Switch = Option<(usize, Vec<(u64, u64)>)>;
@@ -334,6 +369,22 @@ impl Message {
         }) && self.present(multiplexer, data, length)
     }
 
+    /// Whether a frame is whole, as far as the message is protected.
+    fn is_whole(&self, data: &[u8; DATA_BYTES], length: usize) -> bool {
+        self.data_id.is_none_or(|data_id| {
+            let payload = data.first_chunk().filter(|_| length == CLASSIC_BYTES);
+            payload.is_some_and(|payload| e2e::holds(data_id, payload))
+        })
+    }
+
+    /// Whether nothing stands against a signal. A frame too short to say so says nothing for it.
+    fn is_valid(&self, signal: &Coded, data: &[u8; DATA_BYTES], length: usize) -> bool {
+        signal.validity.is_none_or(|index| {
+            let causes = self.signals.get(index);
+            causes.and_then(|causes| causes.bits.of(data, length)) == Some(0)
+        })
+    }
+
     /// A signal's value, NaN where the frame has none.
     fn value(&self, signal: &Coded, data: &[u8; DATA_BYTES], length: usize) -> f64 {
         if !self.present(signal, data, length) {
@@ -373,6 +424,10 @@ pub struct Decoded {
     pub unknown: u64,
     /// Of the described ones, those that are too short for a signal.
     pub short: u64,
+    /// Frames left out: described, and not as they were sent by their end-to-end check.
+    pub broken: u64,
+    /// Values left out: the frame says that they are not valid.
+    pub invalid: u64,
     /// Frames that stood after a later one, put in their place.
     pub disordered: u64,
 }
@@ -467,6 +522,10 @@ impl<'a> Decoder<'a> {
             self.counts.unknown += 1;
             return Ok(());
         };
+        if !message.is_whole(&frame.data, frame.length) {
+            self.counts.broken += 1;
+            return Ok(());
+        }
         let collected = self.collected.entry(id).or_insert_with(|| {
             self.order.push(id);
             Collected {
@@ -495,7 +554,12 @@ impl<'a> Decoder<'a> {
         collected.time_ns.push(time_ns);
         let mut short = false;
         for (signal, values) in message.signals.iter().zip(&mut collected.values) {
-            values.push(message.value(signal, &frame.data, frame.length));
+            let mut value = message.value(signal, &frame.data, frame.length);
+            if !value.is_nan() && !message.is_valid(signal, &frame.data, frame.length) {
+                self.counts.invalid += 1;
+                value = f64::NAN;
+            }
+            values.push(value);
             short |= message.present(signal, &frame.data, frame.length)
                 && signal.bits.of(&frame.data, frame.length).is_none();
         }
@@ -522,9 +586,21 @@ impl<'a> Decoder<'a> {
     }
 
     /// The signals, a series for each message that was received, and what else there was; an error if the bus that was chosen
-    /// had no frame, and others had.
+    /// had no frame, and others had, or if no frame was whole.
     pub fn finish(self) -> Result<(Vec<Series>, Decoded)> {
         self.check_bus()?;
+        if self.order.is_empty() && self.counts.broken > 0 {
+            return Err(Error::new(
+                Kind::Empty,
+                self.source.as_str(),
+                Place::default(),
+                format!(
+                    "{} frames that their end-to-end check does not let pass, and no others of the database",
+                    self.counts.broken
+                ),
+                "frames as they were sent",
+            ));
+        }
         let mut collected = self.collected;
         let mut series = Vec::new();
         for id in self.order {

@@ -7,6 +7,7 @@
 pub mod convert;
 pub mod csv;
 pub mod dbc;
+mod e2e;
 pub mod error;
 pub mod log;
 pub mod mapping;

@@ -134,6 +134,10 @@ fn frames(set: &str, file: &str, format: Format) {
     assert!((40..130).contains(&decoded.unknown), "{file}: {decoded:?}");
     assert_eq!(counts.frames + counts.remote + counts.errors, 4_000);
     assert_eq!((decoded.short, decoded.disordered), (0, 0));
+    // Of the board's messages a half is protected, and one frame in ten of them is not whole.
+    let is_board = set == "board";
+    assert_eq!(decoded.invalid > 500, is_board, "{file}: {decoded:?}");
+    assert_eq!(decoded.broken > 100, is_board, "{file}: {decoded:?}");
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+use core_logic::e2e;
 use proptest::prelude::*;
 use recording::{
     Error, Mapping, Recording,
@@ -488,6 +489,124 @@ fn of_two_buses_one_must_be_chosen() {
     let (read, decoded) = decode_with(DATABASE, log, Some("can1")).unwrap();
     assert_eq!(column(&read, "Shunt.Current_a"), [0.002]);
     assert_eq!((decoded.frames, decoded.unknown), (1, 0));
+}
+
+const BOARD: &str = include_str!("../../can/board.dbc");
+
+/// A frame of the board's database, signals as (first bit, value), protected as the board does it.
+fn board_frame(id: u16, counter: u8, signals: &[(u32, u64)]) -> String {
+    let word = signals
+        .iter()
+        .fold(0, |word, (start, value)| word | value << start);
+    let mut payload = word.to_le_bytes();
+    e2e::protect(e2e::DataId::new(id), counter, &mut payload);
+    hex(id, &payload)
+}
+
+fn hex(id: u16, payload: &[u8]) -> String {
+    let digits: String = payload.iter().map(|byte| format!("{byte:02X}")).collect();
+    format!("{id:03X}#{digits}")
+}
+
+fn board_log(frames: &[String]) -> String {
+    let line = |(index, frame)| format!("({index}.0) can0 {frame}\n");
+    frames.iter().enumerate().map(line).collect()
+}
+
+/// Whatever the cause: the number beside it is not a measured one.
+#[test]
+fn what_the_board_marks_as_not_valid_is_missing() {
+    let causes = (0..8).map(|bit| 1_u64 << bit).chain([0]);
+    for (id, start, column_name, factor) in [
+        (0x101, 32, "i_meas_a", 1e-3),
+        (0x102, 24, "CurrentAverage.CurrentAverage_a", 1e-3),
+        (0x110, 24, "q_meas_c", 1e-3),
+        (0x112, 24, "soc_pct", 0.01),
+    ] {
+        let frames: Vec<String> = causes
+            .clone()
+            .map(|causes| board_frame(id, 3, &[(16, causes), (start, 1500)]))
+            .collect();
+        let (recording, decoded) = decode_with(BOARD, &board_log(&frames), None).unwrap();
+        let expected = [[-1.0; 8].as_slice(), &[1500.0 * factor]].concat();
+        assert_eq!(column(&recording, column_name), expected, "{column_name}");
+        assert_eq!((decoded.frames, decoded.invalid, decoded.broken), (9, 8, 0));
+    }
+    // What nothing is said against stays, and so do the causes.
+    let frames = [board_frame(0x101, 0, &[(16, 16), (32, 1500), (53, 1)])];
+    let (recording, _) = decode_with(BOARD, &board_log(&frames), None).unwrap();
+    assert_eq!(column(&recording, "range_high"), [1.0]);
+    assert_eq!(column(&recording, "Current.CurrentValidity"), [16.0]);
+    // Each of several by its own causes; "not available" is none that was left out.
+    let data = 5_000_u64 | 64 << 16 | 250 << 24 | 0x800 << 44 | 1 << 56;
+    let log = board_log(&[hex(0x130, &data.to_le_bytes())]);
+    let (recording, decoded) = decode_with(BOARD, &log, None).unwrap();
+    assert_eq!(column(&recording, "v_supply_v"), [-1.0]);
+    assert_eq!(column(&recording, "temp_sensor_c"), [25.0]);
+    assert_eq!(decoded.invalid, 1);
+    // A frame that ends before its causes says nothing for its value.
+    let log = board_log(&[hex(0x130, &data.to_le_bytes()[..2])]);
+    let (recording, decoded) = decode_with(BOARD, &log, None).unwrap();
+    assert_eq!(column(&recording, "v_supply_v"), [-1.0]);
+    assert_eq!((decoded.invalid, decoded.short), (1, 1));
+}
+
+#[test]
+fn another_vehicles_signal_of_such_a_name_is_no_validity() {
+    let database = r#"VERSION ""
+
+BU_: A
+
+BO_ 16 Shunt: 8 A
+ SG_ Current : 0|16@1- (1,0) [0|0] "A" A
+ SG_ CurrentValidity : 16|8@1+ (1,0) [0|0] "" A
+
+BA_DEF_ BO_ "E2EProfile" STRING;
+BA_DEF_ BO_ "E2EDataId" INT 0 4095;
+BA_DEF_DEF_ "E2EProfile" "none";
+BA_DEF_DEF_ "E2EDataId" 0;
+BA_ "E2EProfile" BO_ 16 "P11C";
+BA_ "E2EDataId" BO_ 16 16;
+"#;
+    let (recording, decoded) = decode_with(database, "(0.0) can0 010#050001\n", None).unwrap();
+    assert_eq!(column(&recording, "Shunt.Current_a"), [5.0]);
+    assert_eq!((decoded.invalid, decoded.broken), (0, 0));
+}
+
+#[test]
+fn frames_that_are_not_as_they_were_sent_are_left_out() {
+    let good = board_frame(0x101, 3, &[(32, 1500)]);
+    let (recording, decoded) = decode_with(BOARD, &board_log(&[good.clone()]), None).unwrap();
+    assert_eq!(column(&recording, "i_meas_a"), [1.5]);
+    assert_eq!((decoded.frames, decoded.broken), (1, 0));
+    let mut frames = vec![good.clone()];
+    // A digit of the CRC, of counter and data ID, and of the value.
+    for at in [4, 6, 7, 12] {
+        let digit = if good.as_bytes()[at] == b'5' {
+            "6"
+        } else {
+            "5"
+        };
+        frames.push([&good[..at], digit, &good[at + 1..]].concat());
+    }
+    // Another message's, the reserved counter, and one that is too short.
+    frames.push(good.replace("101#", "102#"));
+    frames.push(board_frame(0x101, 15, &[(32, 1500)]));
+    frames.push(good[..good.len() - 2].to_owned());
+    let (recording, decoded) = decode_with(BOARD, &board_log(&frames), None).unwrap();
+    assert_eq!(recording.time_s(), [0.0]);
+    assert_eq!(column(&recording, "i_meas_a"), [1.5]);
+    assert_eq!((decoded.frames, decoded.broken, decoded.short), (1, 7, 0));
+    // Without a whole one it is said why there is nothing.
+    let database = Database::parse("board.dbc", BOARD.as_bytes()).unwrap();
+    let mut decoder = Decoder::new(&database, "log", None, true);
+    let log = board_log(&frames[1..]);
+    log::candump::read("log", log.as_bytes(), &mut |frame| decoder.frame(frame)).unwrap();
+    assert_eq!(
+        decoder.finish().unwrap_err().to_string(),
+        "log: found 7 frames that their end-to-end check does not let pass, and no others of the database, expected \
+         frames as they were sent"
+    );
 }
 
 #[test]

@@ -83,6 +83,11 @@ fn summary(arguments: &Arguments, converted: &Converted) -> String {
         text.push_str(&format!("\n{} frames decoded", decoded.frames));
         let rest = [
             (decoded.unknown, "not in the DBC"),
+            (
+                decoded.broken,
+                "frames left out: wrong by their end-to-end check",
+            ),
+            (decoded.invalid, "values left out: marked as not valid"),
             (decoded.short, "too short for a signal"),
             (decoded.disordered, "put in order of time"),
             (counts.fd, "CAN FD frames in the log"),
