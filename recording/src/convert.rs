@@ -81,6 +81,9 @@ impl Format {
     }
 }
 
+/// Bytes at a file's start that tell its format.
+const TOLD_BY: u64 = 16;
+
 /// How a file is to be read.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
@@ -297,25 +300,27 @@ pub fn recording(path: &Path, mapping: &Mapping) -> Result<Recording> {
     table(path)?.mapped(mapping)?.into_recording()
 }
 
-/// The same without a look at its time. A log is refused by its name.
+/// The same without a look at its time. A log is refused by its name. Opened once: a pipe can be read from its start only then.
 pub fn table(path: &Path) -> Result<Table> {
-    let mut start = Vec::new();
+    let source = path.display().to_string();
+    let mut bytes = Vec::new();
     let reading = |error: io::Error| Error::reading(path, &error);
-    let file = File::open(path).map_err(reading)?;
-    file.take(16).read_to_end(&mut start).map_err(reading)?;
+    let mut file = File::open(path).map_err(reading)?;
+    Read::take(&mut file, TOLD_BY)
+        .read_to_end(&mut bytes)
+        .map_err(reading)?;
     let ending = path.extension().and_then(|ending| ending.to_str());
-    match Format::of(path, &start) {
-        Format::Parquet => parquet::read(path),
+    let format = match Format::of(path, &bytes) {
         // An empty file is told by the reader of CSV, and a name of a column may begin as a log does.
-        Format::Csv => csv::read_table(path),
-        Format::Candump | Format::Asc if start.is_empty() || ending == Some("csv") => {
-            csv::read_table(path)
-        }
-        log => Err(Error::new(
+        Format::Candump | Format::Asc if bytes.is_empty() || ending == Some("csv") => Format::Csv,
+        format => format,
+    };
+    if !matches!(format, Format::Csv | Format::Parquet) {
+        return Err(Error::new(
             Kind::Unsupported,
-            path.display().to_string(),
+            source,
             Place::default(),
-            format!("a log ({})", log.name()),
+            format!("a log ({})", format.name()),
             "a recording as CSV or Parquet: `twin convert` makes one of it",
         )),
     }

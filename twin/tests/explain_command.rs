@@ -252,3 +252,37 @@ fn a_current_is_on_no_axis_of_volts() {
     assert!(page.contains("<p>recorded: "));
     assert!(!page.contains("; reference: "));
 }
+
+/// A pipe can be read once.
+#[cfg(unix)]
+#[test]
+fn a_recording_comes_through_a_pipe_as_from_a_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let mut text = "t_s,i_ref_a,i_meas_a\n".to_owned();
+    for k in 0..300 {
+        let t_s = f64::from(k) * 0.1;
+        let current = 10.0 * (0.37 * t_s).sin();
+        text.push_str(&format!("{t_s},{current},{current}\n"));
+    }
+    fs::write(folder.join("r.csv"), text).unwrap();
+    fs::write(folder.join("m.toml"), "schema = 1\n[sensor]\n").unwrap();
+    assert_eq!(twin(folder, &command::SIMULATE).status.code(), Some(0));
+    let simulated = fs::read(folder.join("s.csv")).unwrap();
+    for recording in ["r.csv", "r.parquet"] {
+        let out = ["convert", "r.csv", "--out", "r.parquet"];
+        assert_eq!(twin(folder, &out).status.code(), Some(0));
+        let command = format!(
+            "cat {recording} | {} simulate --model m.toml --recording /dev/stdin --out piped.csv",
+            env!("CARGO_BIN_EXE_twin")
+        );
+        let mut shell = std::process::Command::new("sh");
+        let output = shell
+            .current_dir(folder)
+            .args(["-c", &command])
+            .output()
+            .unwrap();
+        assert_eq!(output.status.code(), Some(0), "{output:?}");
+        assert_eq!(fs::read(folder.join("piped.csv")).unwrap(), simulated);
+    }
+}
