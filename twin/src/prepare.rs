@@ -190,10 +190,15 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
     }
     for item in &mut items {
         model_effects(model, item)?;
-        if purpose.compares() {
-            if let Some(remark) = slips::leave_out(&mut item.problem) {
-                work.remark(remark);
-            }
+        if purpose.compares()
+            && let Some(remark) = slips::leave_out(&mut item.problem)
+        {
+            work.remark(remark);
+        }
+    }
+    if purpose.compares() {
+        work.few_of_a_counter(&mut items);
+        for item in &items {
             checks::enough(&item.problem, frame.source())?;
         }
     }
@@ -276,7 +281,10 @@ impl<'a> Work<'a> {
                 self.frame.source()
             ));
         }
-        if let Some(charge) = model.charge.as_ref().filter(|_| !has(View::Charge)) {
+        if let Some(charge) = model.charge.as_ref()
+            && !has(View::Charge)
+            && self.charge_column().is_none()
+        {
             self.remark(format!(
                 "[charge] is not compared: no column {} in {}",
                 charge.column.as_deref().unwrap_or("q_meas_c"),
@@ -286,6 +294,33 @@ impl<'a> Work<'a> {
         if let Some(battery) = &model.battery {
             battery::not_compared(self, battery, items);
         }
+    }
+
+    /// Puts a charge counter aside that has too few readings, where something else has enough.
+    fn few_of_a_counter(&mut self, items: &mut Vec<Item>) {
+        let has_enough = |item: &Item| item.problem.observed.valid_rows() >= FEWEST_ROWS;
+        let is_counter = |item: &Item| item.problem.view == View::Charge;
+        if !items
+            .iter()
+            .any(|item| !is_counter(item) && has_enough(item))
+        {
+            return;
+        }
+        items.retain(|item| {
+            let stays = !is_counter(item) || has_enough(item);
+            if !stays {
+                let rows = item.problem.observed.valid_rows();
+                self.counter_aside(&item.problem.name, rows);
+            }
+            stays
+        });
+    }
+
+    fn counter_aside(&mut self, column: &str, rows: usize) {
+        self.remark(format!(
+            "[charge] is not compared: {column} has {rows} readings to compare in {}, expected at least {FEWEST_ROWS}",
+            self.frame.source()
+        ));
     }
 
     /// The sensor, and its charge counter.
@@ -398,7 +433,16 @@ impl<'a> Work<'a> {
                 fresh,
             });
         }
-        if let Some(counter) = counter {
+        let is_empty = |column: &str| {
+            let values = self.frame.column(column);
+            values.is_some_and(|values| values.iter().all(|value| value.is_nan()))
+        };
+        let empty = counter
+            .as_deref()
+            .filter(|column| value.is_some() && self.purpose.compares() && is_empty(column));
+        if let Some(counter) = empty {
+            self.counter_aside(counter, 0);
+        } else if let Some(counter) = counter {
             items.extend(charge::item(
                 self,
                 sensor,

@@ -707,6 +707,54 @@ fn counted(factor: f64) -> String {
                 current(t) + noise,
                 factor * charge(t)
             )
+#[test]
+fn a_counter_with_too_few_readings_is_put_aside() {
+    let model = "schema = 1\n[sensor]\nnoise = 0.1\n[charge]\n";
+    let recording = |measured: bool, every: usize, most: usize| {
+        let mut k = 0;
+        "t_s,i_ref_a,i_meas_a,q_meas_c\n".to_owned()
+            + &rows(1200, |t| {
+                k += 1;
+                let charge = 10.0 / 0.37 * (1.0 - (0.37 * t).cos());
+                let told = k % every == 0 && k / every <= most;
+                format!(
+                    "{t},{},{},{}",
+                    current(t),
+                    if measured {
+                        (current(t) + 0.5).to_string()
+                    } else {
+                        String::new()
+                    },
+                    if told {
+                        charge.to_string()
+                    } else {
+                        String::new()
+                    }
+                )
+            })
+    };
+    for (every, most) in [(28, 42), (1, 0), (5, 1), (5, 2)] {
+        let files = [("m.toml", model), ("r.csv", &recording(true, every, most))];
+        let said = report(&files, &[]);
+        says(
+            &said["remarks"].to_string(),
+            &[
+                "[charge] is not compared: q_meas_c has ",
+                "in r.csv, expected at least 50",
+            ],
+        );
+        assert_eq!(said["effects"][0]["id"], "offset");
+        let signals = said["signals"].as_array().unwrap();
+        assert_eq!(signals.len(), 1, "{signals:?}");
+    }
+    // With nothing beside it, it is refused.
+    let alone = recording(true, 28, 42).replace("i_meas_a", "other");
+    says(
+        &explained(model, &alone),
+        &["r.csv, column q_meas_c: found ", "expected at least 50"],
+    );
+}
+
         })
 }
 
