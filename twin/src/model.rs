@@ -216,7 +216,7 @@ fn one_cell() -> u32 {
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Text {
-    schema: u32,
+    schema: Option<u32>,
     #[serde(default)]
     name: String,
     #[serde(default)]
@@ -266,11 +266,19 @@ impl Model {
     pub fn parse(source: &str, text: String, folder: &Path) -> Result<Self, Failure> {
         let places = Places::new(source, &text);
         let parsed: Text = toml::from_str(&text).map_err(|error| places.syntax(&error))?;
-        if parsed.schema != SCHEMA {
+        let version = "the version of the format that is read here";
+        let Some(schema) = parsed.schema else {
             return Err(places.fault(
                 &["schema"],
-                &parsed.schema.to_string(),
-                &format!("{SCHEMA}, the version of the format that is read here"),
+                "none",
+                &format!("schema = {SCHEMA}, {version}"),
+            ));
+        };
+        if schema != SCHEMA {
+            return Err(places.fault(
+                &["schema"],
+                &schema.to_string(),
+                &format!("{SCHEMA}, {version}"),
             ));
         }
         if let Some(sensor) = &parsed.sensor {
@@ -296,7 +304,15 @@ impl Model {
             parsed.charge.as_ref().and_then(|it| it.column.as_ref()),
             battery.as_ref().and_then(|it| it.current.as_ref()),
         ];
-        for name in parsed.columns.keys() {
+        for (name, column) in &parsed.columns {
+            let plain = column.trim();
+            if plain.strip_prefix('-').unwrap_or(plain).trim().is_empty() {
+                return Err(places.fault(
+                    &["columns", name],
+                    &format!("{column:?}"),
+                    "the name of a column, or a minus and its name",
+                ));
+            }
             if name::meaning(name).is_none() && !stated.contains(&Some(name)) {
                 let known = name::CANONICAL.map(|known| known.name).join(", ");
                 return Err(places.fault(

@@ -569,6 +569,24 @@ fn a_column_compared_with_itself() {
 }
 
 #[test]
+fn a_column_without_a_name_and_a_file_without_a_version_have_their_place() {
+    for name in ["\"\"", "\" \"", "\"-\""] {
+        let model = format!("schema = 1\n[sensor]\n\n[columns]\ni_meas_a = {name}\n");
+        assert_eq!(
+            explained(&model, &good()).trim_end(),
+            format!(
+                "error: m.toml, line 5, key columns.i_meas_a: found {name}, expected the name of a column, \
+                 or a minus and its name"
+            )
+        );
+    }
+    assert_eq!(
+        explained("[sensor]\n", &good()).trim_end(),
+        "error: m.toml, key schema: found none, expected schema = 1, the version of the format that is read here"
+    );
+}
+
+#[test]
 fn what_is_not_compared_is_said() {
     let model =
         "schema = 1\n[sensor]\n[charge]\n[battery]\ncapacity_ah = 2\nocv = [[0, 3.0], [1, 4.0]]\n";
@@ -689,24 +707,6 @@ fn a_number_that_is_no_reading() {
     report(&[("m.toml", PAIR), ("r.csv", &noted)], &[]);
 }
 
-const COUNTED: &str = "schema = 1\n[sensor]\nnoise = 0.1\n[charge]\n";
-
-/// A sensor with a counter that shows `factor` times the charge, set anew in the middle.
-fn counted(factor: f64) -> String {
-    // What current() comes to since 0 s.
-    let charge = |t: f64| {
-        let swings = |t: f64| -10.0 / 0.37 * (0.37 * t).cos() - 3.0 / 1.91 * (1.91 * t).cos() + t;
-        swings(t) - swings(if t < 60.0 { 0.0 } else { 60.0 })
-    };
-    "t_s,i_ref_a,i_meas_a,q_meas_c\n".to_owned()
-        + &rows(1200, |t| {
-            let noise = 0.1 * (77.7 * t).sin();
-            format!(
-                "{t},{},{},{}",
-                current(t),
-                current(t) + noise,
-                factor * charge(t)
-            )
 #[test]
 fn a_counter_with_too_few_readings_is_put_aside() {
     let model = "schema = 1\n[sensor]\nnoise = 0.1\n[charge]\n";
@@ -755,6 +755,24 @@ fn a_counter_with_too_few_readings_is_put_aside() {
     );
 }
 
+const COUNTED: &str = "schema = 1\n[sensor]\nnoise = 0.1\n[charge]\n";
+
+/// A sensor with a counter that shows `factor` times the charge, set anew in the middle.
+fn counted(factor: f64) -> String {
+    // What current() comes to since 0 s.
+    let charge = |t: f64| {
+        let swings = |t: f64| -10.0 / 0.37 * (0.37 * t).cos() - 3.0 / 1.91 * (1.91 * t).cos() + t;
+        swings(t) - swings(if t < 60.0 { 0.0 } else { 60.0 })
+    };
+    "t_s,i_ref_a,i_meas_a,q_meas_c\n".to_owned()
+        + &rows(1200, |t| {
+            let noise = 0.1 * (77.7 * t).sin();
+            format!(
+                "{t},{},{},{}",
+                current(t),
+                current(t) + noise,
+                factor * charge(t)
+            )
         })
 }
 
