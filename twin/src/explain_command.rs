@@ -35,7 +35,7 @@ Example:
   twin explain --model board.toml --recording drive.csv --holdout other-day.csv --out report
 
 Writes report/report.json, report/report.html (one file, no network) and report/model.toml, the model file with the
-physics that was found; report/calibration.toml where the board can correct it. docs/model-file.md describes the model
+physics that was found; report/calibration.toml where the board can correct it (one of an earlier run is removed). docs/model-file.md describes the model
 file, `twin effects` lists the physics that is looked for.";
 /// What is written; the last only where the board can correct something.
 const FILES: [&str; 4] = [
@@ -193,13 +193,20 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     if let Some(text) = calibration.text {
         files.push((registers, text));
     }
-    write(&folder, &files)?;
+    let removed = write(&folder, &files)?;
     let width = std::env::var("COLUMNS")
         .ok()
         .and_then(|width| width.parse().ok());
-    Ok(text::render(&report, width.unwrap_or(WIDTH))
+    let mut said = text::render(&report, width.unwrap_or(WIDTH))
         .trim_end()
-        .to_owned())
+        .to_owned();
+    if let Some(path) = removed {
+        said.push_str(&format!(
+            "\n\nRemoved {}, of an earlier run: this one has nothing that the board could correct.",
+            path.display()
+        ));
+    }
+    Ok(said)
 }
 
 /// The problems with as many readings as fits look at: the memory of the others is free.
@@ -296,8 +303,8 @@ fn changes<'a>(prepared: &'a Prepared, item: &'a Item) -> impl Iterator<Item = (
         })
 }
 
-/// All files, or none.
-fn write(folder: &Folder, files: &[(&str, String)]) -> Result<(), Failure> {
+/// All files, or none. What an earlier run has left and this one has not written is removed, and returned.
+fn write(folder: &Folder, files: &[(&str, String)]) -> Result<Option<PathBuf>, Failure> {
     let mut finished = Vec::new();
     for (name, content) in files {
         let path = folder.path().join(name);
@@ -311,8 +318,9 @@ fn write(folder: &Folder, files: &[(&str, String)]) -> Result<(), Failure> {
     let calibration = folder.path().join("calibration.toml");
     if files.iter().all(|(name, _)| *name != "calibration.toml") && calibration.exists() {
         fs::remove_file(&calibration).map_err(|error| Error::writing(&calibration, &error))?;
+        return Ok(Some(calibration));
     }
-    Ok(())
+    Ok(None)
 }
 
 /// The model file with what was found.

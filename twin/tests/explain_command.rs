@@ -234,6 +234,40 @@ fn a_power_sensor_in_its_own_words() {
 }
 
 #[test]
+fn a_calibration_of_an_earlier_run_does_not_stay_and_is_said_to_be_removed() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let mut text = "t_s,i_ref_a,i_meas_a\n".to_owned();
+    for k in 0..300 {
+        let t_s = f64::from(k) * 0.1;
+        let current = 10.0 * (0.37 * t_s).sin();
+        text.push_str(&format!("{t_s},{current},{}\n", current + 0.5));
+    }
+    fs::write(folder.join("r.csv"), text).unwrap();
+    // No board, nothing to correct.
+    fs::write(folder.join("m.toml"), "schema = 1\n[sensor]\n").unwrap();
+    let said = |output: Output| {
+        assert_eq!(output.status.code(), Some(0), "{output:?}");
+        String::from_utf8(output.stdout).unwrap()
+    };
+    assert!(!said(explained(folder, &[])).contains("Removed"));
+    let old = folder.join("out/calibration.toml");
+    fs::write(&old, "# older\n").unwrap();
+    let summary = said(explained(folder, &[]));
+    assert!(!old.exists());
+    let expected = format!(
+        "Removed {}, of an earlier run",
+        Path::new("out/calibration.toml").display()
+    );
+    assert!(summary.contains(&expected), "{summary}");
+    // A run that is refused touches nothing.
+    fs::write(&old, "# older\n").unwrap();
+    fs::write(folder.join("r.csv"), "t_s,i_ref_a,i_meas_a\n0,1,1\n").unwrap();
+    assert_eq!(explained(folder, &[]).status.code(), Some(2));
+    assert!(old.exists());
+}
+
+#[test]
 fn a_current_is_on_no_axis_of_volts() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
