@@ -1,4 +1,4 @@
-//! A recording as what the vehicle does: checked whole before anything runs.
+//! A recording as what the vehicle does: all that is driven is checked before anything runs.
 
 use std::path::Path;
 
@@ -69,8 +69,8 @@ const LIMITS: [(&str, f64, f64, &str); 6] = [
 /// used where they are.
 ///
 /// # Errors
-/// With file, line and column: a column missing, a value missing or not finite, time running backwards, a current beyond
-/// the sensor, a temperature or voltage that cannot be, a key position that does not exist.
+/// With file, line and column: a column missing, time running backwards, a temperature or voltage that cannot be; in the part
+/// that is driven a current that is missing or beyond the sensor, and up to its end a key position that does not exist.
 pub fn read(
     path: &Path,
     mapping: &Mapping,
@@ -113,6 +113,15 @@ pub fn from_recording(
     for (index, (t_s, recorded_a)) in time.iter().zip(current).enumerate() {
         let t_s = t_s - start - options.skip_s;
         let current_a = recorded_a * options.scale;
+        let mut row = Row::at_rest(t_s).with_current(current_a);
+        columns.fill(&mut row, recording, index, last.as_ref())?;
+        last = Some(row);
+        if t_s < 0.0 {
+            continue;
+        }
+        if options.duration_s.is_some_and(|limit| t_s > limit) {
+            break;
+        }
         if !current_a.is_finite() {
             return Err(recording.table().error_at(
                 Kind::Unsupported,
@@ -137,15 +146,6 @@ pub fn from_recording(
                     options.limit_a
                 ),
             ));
-        }
-        let mut row = Row::at_rest(t_s).with_current(current_a);
-        columns.fill(&mut row, recording, index, last.as_ref())?;
-        last = Some(row);
-        if t_s < 0.0 {
-            continue;
-        }
-        if options.duration_s.is_some_and(|limit| t_s > limit) {
-            break;
         }
         row.t_s = t_s + options.lead_s;
         rows.push(row);
@@ -334,6 +334,26 @@ mod tests {
             (0.0, Key::Accessory)
         );
         assert_eq!(profile.contactors, Contactors::Permitted);
+    }
+
+    /// A recording with a gap still has parts that can be driven.
+    #[test]
+    fn only_the_current_of_the_part_that_is_driven_has_to_be_there() {
+        let text = "t_s,i_ref_a\n0,1\n1,\n2,3\n3,4\n4,700\n";
+        let part = |skip_s, duration_s| {
+            let options = ProfileOptions {
+                skip_s,
+                duration_s: Some(duration_s),
+                lead_s: 0.0,
+                tail_s: 0.0,
+                ..ProfileOptions::default()
+            };
+            profile(text, &options).map(|profile| profile.rows.len())
+        };
+        assert_eq!(part(2.0, 1.0).unwrap(), 2);
+        assert_eq!(part(0.0, 0.5).unwrap(), 1);
+        assert!(part(0.0, 1.0).unwrap_err().to_string().contains("line 3"));
+        assert!(part(2.0, 2.0).unwrap_err().to_string().contains("line 6"));
     }
 
     #[test]
