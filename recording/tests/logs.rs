@@ -2,7 +2,10 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+use std::io::Write;
+
 use core_logic::e2e;
+use flate2::{Compression, write::ZlibEncoder};
 use proptest::prelude::*;
 use recording::{
     Error, Mapping, Recording,
@@ -95,6 +98,28 @@ fn candump_faults_have_their_place() {
             "log, line 1, column 1: found \"x\", expected a time such as (1436509052.249713)",
         ),
         (
+#[test]
+fn a_vector_ascii_log_that_is_cut_loses_its_last_line() {
+    let first = "base hex timestamps absolute\n0.5 1 123 Rx d 2 01 02\n";
+    for second in [
+        "  1.25 1 123 Rx d 2 03 04",
+        "  1.25 CANFD 1 Rx 123 Name 1 0 2 2 03 04 100 130 3000 46 8",
+    ] {
+        let log = format!("{first}{second}");
+        for length in first.len() + 3..=log.len() {
+            let (frames, counts) = read(ASC, &log.as_bytes()[..length]).unwrap();
+            assert_eq!(frames, [plain(500_000_000, "1", 0x123, &[1, 2])]);
+            assert_eq!((counts.frames, counts.cut), (1, 1), "{length}");
+        }
+        let (frames, counts) = read(ASC, format!("{log}\n").as_bytes()).unwrap();
+        assert_eq!((frames.len(), counts.cut), (2, 0));
+    }
+    // The end of the last block is none of its events.
+    let log = format!("{first}End TriggerBlock");
+    let (frames, counts) = read(ASC, log.as_bytes()).unwrap();
+    assert_eq!((frames.len(), counts.cut), (1, 0));
+}
+
             "(1.0)",
             "log, line 1, column 2: found \"\", expected an interface such as can0",
         ),
@@ -265,6 +290,7 @@ fn vector_ascii_faults_have_their_place() {
 fn vector_binary_faults_have_their_place() {
     let header = {
         let mut header = b"LOGG".to_vec();
+        let log = format!("{log}\n");
         header.extend(144_u32.to_le_bytes());
         header.resize(144, 0);
         header
@@ -312,17 +338,71 @@ fn vector_binary_faults_have_their_place() {
             "log, byte 4: found a header of 144 bytes, expected one that fits the file",
         ),
         (
-            whole[..150].to_vec(),
+            log(b"LOBX"),
             "log, byte 144: found no object, expected an object that begins with LOBJ",
-        ),
-        (
-            whole[..180].to_vec(),
-            "log, byte 144: found the end of the file, expected the rest of this object",
         ),
         (
             log(&object(
                 10,
                 &[2, 0, 0, 0, 0, 0, 0, 0, 9, 0, 0, 0, 0, 0, 0, 0, 1, 2, 3],
+    // Wherever it is cut, of the second frame nothing is made up.
+    let two = log(&[object(1, &message), object(1, &message)].concat());
+    for length in whole.len() + 1..two.len() {
+        let (frames, counts) = read(BLF, &two[..length]).unwrap();
+        assert_eq!(frames, [plain(5, "2", 0x123, &[1, 2, 3])]);
+        assert_eq!((counts.frames, counts.cut), (1, 1), "{length}");
+    }
+    // Nor where an object ends beyond its container, and the next one is not there.
+    let packed = |inside: &[u8]| {
+        let mut container = b"LOBJ".to_vec();
+        container.extend([16, 0, 1, 0]);
+        container.extend((32 + inside.len() as u32).to_le_bytes());
+        container.extend(10_u32.to_le_bytes());
+        container.extend([0; 16]);
+        container.extend(inside);
+        container
+    };
+    let mut inside = object(1, &message);
+    inside.extend(&object(1, &message)[..30]);
+    let (frames, counts) = read(BLF, &log(&packed(&inside))).unwrap();
+    assert_eq!((frames.len(), counts.cut), (1, 1));
+    // Of a container that is cut, what is whole, packed or not.
+    let inside = object(1, &message).repeat(50);
+    let mut encoder = ZlibEncoder::new(Vec::new(), Compression::none());
+    encoder.write_all(&inside).unwrap();
+    let packed = object(
+        10,
+        &[
+            &[2, 0, 0, 0, 0, 0, 0, 0][..],
+            &(inside.len() as u32).to_le_bytes(),
+            &[0; 4],
+            &encoder.finish().unwrap(),
+        ]
+        .concat(),
+    );
+    // A container's header is shorter than that of other objects by 16 bytes.
+    let packed = log(&[
+        &packed[..4],
+        &[16, 0, 1, 0],
+        &((packed.len() - 16) as u32).to_le_bytes(),
+        &packed[12..16],
+        &packed[32..],
+    ]
+    .concat());
+    assert_eq!(read(BLF, &packed).unwrap().0.len(), 50);
+    let mut most = 0;
+    for length in 145..packed.len() {
+        let (frames, counts) = read(BLF, &packed[..length]).unwrap();
+        assert!(
+            frames
+                .iter()
+                .all(|frame| *frame == plain(5, "2", 0x123, &[1, 2, 3]))
+        );
+        assert!(frames.len() >= most && counts.cut == 1, "{length}");
+        most = frames.len();
+    }
+    assert!(most >= 49, "{most}");
+
             )),
             "log, byte 144: found \"corrupt deflate stream\", expected a container packed by zlib",
         ),

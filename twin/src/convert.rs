@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use recording::{
     Mapping,
-    convert::{self, Converted, Options},
+    convert::{self, Converted, Format, Options},
     dbc::Database,
     output,
 };
@@ -81,6 +81,10 @@ fn summary(arguments: &Arguments, converted: &Converted) -> String {
     );
     if let Some((counts, decoded)) = &converted.counts {
         text.push_str(&format!("\n{} frames decoded", decoded.frames));
+        let cut = match converted.format {
+            Format::Blf => "left out: the log ends within its last object",
+            _ => "left out: the log ends within its last line",
+        };
         let rest = [
             (decoded.unknown, "not in the DBC"),
             (
@@ -94,7 +98,7 @@ fn summary(arguments: &Arguments, converted: &Converted) -> String {
             (counts.remote, "remote frames"),
             (counts.errors, "error frames"),
             (counts.others, "other events"),
-            (counts.cut, "left out: the log ends within its last line"),
+            (counts.cut, cut),
         ];
         for (count, what) in rest {
             if count > 0 {

@@ -77,6 +77,27 @@ fn a_log_that_is_cut_is_said_to_be() {
 }
 
 #[test]
+fn a_vector_ascii_log_that_is_cut_is_said_to_be_and_the_rest_stays() {
+    let folder = folder();
+    let log = "base hex timestamps absolute\n0.5 1 10 Rx d 4 E8 03 0C 0E\n1.25 1 10 Rx d 2 18 FC";
+    for length in [log.len(), log.len() - 1, log.len() - 2] {
+        fs::write(folder.path().join("cut.asc"), &log[..length]).unwrap();
+        let arguments = ["convert", "cut.asc", "--dbc", "v.dbc", "--out", "cut.csv"];
+        let output = twin(folder.path(), &arguments);
+        assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+        let said = text(&output.stdout);
+        assert!(
+            said.contains("1 left out: the log ends within its last line"),
+            "{said}"
+        );
+        assert_eq!(
+            fs::read_to_string(folder.path().join("cut.csv")).unwrap(),
+            "t_s,Shunt.Current_a,Shunt.Volt_v\n0.5,1,3.596\n"
+        );
+    }
+}
+
+#[test]
 fn columns_are_mapped_and_parquet_holds_the_same() {
     let folder = folder();
     let mut arguments = vec!["convert", "drive.log", "--dbc", "v.dbc"];

@@ -12,7 +12,7 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
     let mut header = Header::default();
     let mut last_ns = 0_i64;
     let mut lines = Lines::new(source, reader);
-    while let Some((number, line, _)) = lines.next()? {
+    while let Some((number, line, ended)) = lines.next()? {
         // Events begin with their time, everything else with a word or a comment mark.
         if !line.starts_with(|first: char| first.is_ascii_digit()) {
             header.line(line);
@@ -23,6 +23,11 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
                 Kind::Format,
                 source,
                 Place::line(number),
+        // Half a byte looks like a smaller one.
+        if !ended {
+            counts.cut += 1;
+            continue;
+        }
                 quoted(line),
                 "a header with \"base hex\" or \"base dec\" before the first event",
             ));

@@ -45,7 +45,7 @@ pub struct Counts {
     pub remote: u64,
     /// Other events.
     pub others: u64,
-    /// A last line without an end: it may be cut, and is left out.
+    /// A last line without an end, or a last object or container that the file ends within: it is left out.
     pub cut: u64,
 }
 
