@@ -185,7 +185,8 @@ pub fn read(path: &Path, options: &Options, progress: &mut dyn FnMut(f64)) -> Re
         options.bus.as_deref(),
         format == Format::Candump,
     );
-    let counts = log(&source, reader, &mut |frame| decoder.frame(frame))?;
+    let bus = options.bus.as_deref();
+    let counts = log(&source, bus, reader, &mut |frame| decoder.frame(frame))?;
     let (series, decoded) = decoder.finish()?;
     let merged = Merged::new(&source, series)?;
     Ok(Converted {
@@ -210,7 +211,7 @@ fn replaced(mapping: &Mapping, columns: &dyn Columns) -> Vec<String> {
 
 /// Measured signals and logged frames of one file, merged.
 fn from_mdf(source: &str, bytes: &[u8], options: &Options) -> Result<Converted> {
-    let contents = mdf::read(source, bytes)?;
+    let contents = mdf::read(source, options.bus.as_deref(), bytes)?;
     let mut series = contents.series;
     let mut counts = None;
     if !contents.frames.is_empty() {
@@ -322,6 +323,12 @@ pub fn table(path: &Path) -> Result<Table> {
             Place::default(),
             format!("a log ({})", format.name()),
             "a recording as CSV or Parquet: `twin convert` makes one of it",
-        )),
+        ));
+    }
+    file.read_to_end(&mut bytes).map_err(reading)?;
+    if format == Format::Parquet {
+        parquet::parse(&source, bytes)
+    } else {
+        csv::parse(&source, &bytes)
     }
 }

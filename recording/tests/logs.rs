@@ -15,12 +15,12 @@ use recording::{
     merge::Merged,
 };
 
-type Reader = fn(&str, &[u8], &mut log::Sink<'_>) -> Result<Counts, Error>;
+type Reader = fn(&str, Option<&str>, &[u8], &mut log::Sink<'_>) -> Result<Counts, Error>;
 
 const READERS: [Reader; 3] = [
-    |source, bytes, sink| log::candump::read(source, bytes, sink),
-    |source, bytes, sink| log::asc::read(source, bytes, sink),
-    |source, bytes, sink| log::blf::read(source, bytes, sink),
+    |source, bus, bytes, sink| log::candump::read(source, bus, bytes, sink),
+    |source, bus, bytes, sink| log::asc::read(source, bus, bytes, sink),
+    |source, bus, bytes, sink| log::blf::read(source, bus, bytes, sink),
 ];
 const CANDUMP: Reader = READERS[0];
 const ASC: Reader = READERS[1];
@@ -30,8 +30,16 @@ const BLF: Reader = READERS[2];
 type Plain = (i64, String, i64, Vec<u8>);
 
 fn read(reader: Reader, bytes: &[u8]) -> Result<(Vec<Plain>, Counts), Error> {
+    read_bus(reader, None, bytes)
+}
+
+fn read_bus(
+    reader: Reader,
+    bus: Option<&str>,
+    bytes: &[u8],
+) -> Result<(Vec<Plain>, Counts), Error> {
     let mut frames = Vec::new();
-    let counts = reader("log", bytes, &mut |frame| {
+    let counts = reader("log", bus, bytes, &mut |frame| {
         let id = i64::from(frame.id) * if frame.extended { -1 } else { 1 };
         assert!(frame.data[frame.length..].iter().all(|&byte| byte == 0));
         let data = frame.data[..frame.length].to_vec();
@@ -91,14 +99,6 @@ fn a_candump_log_that_is_cut_loses_its_last_line() {
 }
 
 #[test]
-fn candump_faults_have_their_place() {
-    let cases = [
-        (
-            "x",
-            "log, line 1, column 1: found \"x\", expected a time such as (1436509052.249713)",
-        ),
-        (
-#[test]
 fn a_vector_ascii_log_that_is_cut_loses_its_last_line() {
     let first = "base hex timestamps absolute\n0.5 1 123 Rx d 2 01 02\n";
     for second in [
@@ -120,6 +120,14 @@ fn a_vector_ascii_log_that_is_cut_loses_its_last_line() {
     assert_eq!((frames.len(), counts.cut), (1, 0));
 }
 
+#[test]
+fn candump_faults_have_their_place() {
+    let cases = [
+        (
+            "x",
+            "log, line 1, column 1: found \"x\", expected a time such as (1436509052.249713)",
+        ),
+        (
             "(1.0)",
             "log, line 1, column 2: found \"\", expected an interface such as can0",
         ),
@@ -282,6 +290,7 @@ fn vector_ascii_faults_have_their_place() {
         ),
     ];
     for (log, sentence) in cases {
+        let log = format!("{log}\n");
         assert_eq!(read(ASC, log.as_bytes()).unwrap_err().to_string(), sentence);
     }
 }
@@ -290,7 +299,6 @@ fn vector_ascii_faults_have_their_place() {
 fn vector_binary_faults_have_their_place() {
     let header = {
         let mut header = b"LOGG".to_vec();
-        let log = format!("{log}\n");
         header.extend(144_u32.to_le_bytes());
         header.resize(144, 0);
         header
@@ -327,24 +335,20 @@ fn vector_binary_faults_have_their_place() {
     assert_eq!(frames, [plain(5, "1", 0x123, &fd[20..84])]);
     assert_eq!((counts.frames, counts.fd), (1, 1));
 
+    // A remote frame and an error frame on the bus 2, another error frame on the bus 1.
+    let remote = [2, 0, 0x80, 3, 0x23, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
+    let objects = [
+        object(1, &remote),
+        object(2, &[2, 0, 0, 0, 0, 0, 0, 0]),
+        object(104, &[1; 44]),
+    ]
+    .concat();
+    for (bus, counted) in [(None, (2, 1)), (Some("1"), (1, 0)), (Some("2"), (1, 1))] {
+        let (_, counts) = read_bus(BLF, bus, &log(&objects)).unwrap();
+        assert_eq!((counts.errors, counts.remote), counted);
+    }
+
     let whole = log(&object(1, &message));
-    for (bytes, sentence) in [
-        (
-            b"LOBJ".to_vec(),
-            "log, byte 0: found another kind of file, expected a BLF file, beginning with LOGG",
-        ),
-        (
-            whole[..100].to_vec(),
-            "log, byte 4: found a header of 144 bytes, expected one that fits the file",
-        ),
-        (
-            log(b"LOBX"),
-            "log, byte 144: found no object, expected an object that begins with LOBJ",
-        ),
-        (
-            log(&object(
-                10,
-                &[2, 0, 0, 0, 0, 0, 0, 0, 9, 0, 0, 0, 0, 0, 0, 0, 1, 2, 3],
     // Wherever it is cut, of the second frame nothing is made up.
     let two = log(&[object(1, &message), object(1, &message)].concat());
     for length in whole.len() + 1..two.len() {
@@ -403,6 +407,23 @@ fn vector_binary_faults_have_their_place() {
     }
     assert!(most >= 49, "{most}");
 
+    for (bytes, sentence) in [
+        (
+            b"LOBJ".to_vec(),
+            "log, byte 0: found another kind of file, expected a BLF file, beginning with LOGG",
+        ),
+        (
+            whole[..100].to_vec(),
+            "log, byte 4: found a header of 144 bytes, expected one that fits the file",
+        ),
+        (
+            log(b"LOBX"),
+            "log, byte 144: found no object, expected an object that begins with LOBJ",
+        ),
+        (
+            log(&object(
+                10,
+                &[2, 0, 0, 0, 0, 0, 0, 0, 9, 0, 0, 0, 0, 0, 0, 0, 1, 2, 3],
             )),
             "log, byte 144: found \"corrupt deflate stream\", expected a container packed by zlib",
         ),
@@ -473,7 +494,7 @@ fn decode_with(
 ) -> Result<(Recording, Decoded), Error> {
     let database = Database::parse("v.dbc", database.as_bytes())?;
     let mut decoder = Decoder::new(&database, "log", bus, true);
-    log::candump::read("log", log.as_bytes(), &mut |frame: &Frame<'_>| {
+    log::candump::read("log", None, log.as_bytes(), &mut |frame: &Frame<'_>| {
         decoder.frame(frame)
     })?;
     let (series, decoded) = decoder.finish().unwrap();
@@ -552,6 +573,25 @@ fn small_disorder_is_put_right_and_a_set_clock_is_refused() {
         error.to_string(),
         "log, line 2: found -1.5 s, expected a time not more than 1 s before the last one, 0 s"
     );
+}
+
+#[test]
+fn what_another_bus_carries_is_not_counted() {
+    let told = |reader, bus, log: &str| {
+        let (frames, counts) = read_bus(reader, bus, log.as_bytes()).unwrap();
+        assert_eq!(frames.len(), 3);
+        (counts.errors, counts.remote, counts.fd, counts.others)
+    };
+    let log = "(1.0) can0 123#01\n(1.1) can1 123##001\n(1.2) can1 20000080#\n(1.3) can0 123#R\n(1.4) can1 123#02\n";
+    assert_eq!(told(CANDUMP, None, log), (1, 1, 1, 0));
+    assert_eq!(told(CANDUMP, Some("can0"), log), (0, 1, 0, 0));
+    assert_eq!(told(CANDUMP, Some("can1"), log), (1, 0, 1, 0));
+    let log = "base hex timestamps absolute\n0.0 Start of measurement\n1.0 1 123 Rx d 1 01\n\
+        1.1 CANFD 2 Rx 123 1 0 1 1 02 0 0 1000\n1.2 2 ErrorFrame\n1.3 1 123 Rx r\n\
+        1.4 2 Statistic: D 0\n1.5 2 123 Rx d 1 03\n";
+    assert_eq!(told(ASC, None, log), (1, 1, 1, 2));
+    assert_eq!(told(ASC, Some("1"), log), (0, 1, 0, 1));
+    assert_eq!(told(ASC, Some("2"), log), (1, 0, 1, 2));
 }
 
 #[test]
@@ -681,7 +721,10 @@ fn frames_that_are_not_as_they_were_sent_are_left_out() {
     let database = Database::parse("board.dbc", BOARD.as_bytes()).unwrap();
     let mut decoder = Decoder::new(&database, "log", None, true);
     let log = board_log(&frames[1..]);
-    log::candump::read("log", log.as_bytes(), &mut |frame| decoder.frame(frame)).unwrap();
+    log::candump::read("log", None, log.as_bytes(), &mut |frame| {
+        decoder.frame(frame)
+    })
+    .unwrap();
     assert_eq!(
         decoder.finish().unwrap_err().to_string(),
         "log: found 7 frames that their end-to-end check does not let pass, and no others of the database, expected \
@@ -704,7 +747,7 @@ fn signals_get_the_names_that_are_asked_for() {
     let merged = || {
         let mut decoder = Decoder::new(&database, "log", None, true);
         let log = "(1.0) can0 010#0100010000\n(1.1) can0 011#02\n";
-        log::candump::read("log", log.as_bytes(), &mut |frame: &Frame<'_>| {
+        log::candump::read("log", None, log.as_bytes(), &mut |frame: &Frame<'_>| {
             decoder.frame(frame)
         })
         .unwrap();
@@ -786,7 +829,7 @@ fn units_of_editors_that_write_latin_1_are_known() {
     let database = Database::parse("v.dbc", &text).unwrap();
     let mut decoder = Decoder::new(&database, "log", None, true);
     let log = "(1.0) can0 010#0000024100\n";
-    log::candump::read("log", log.as_bytes(), &mut |frame: &Frame<'_>| {
+    log::candump::read("log", None, log.as_bytes(), &mut |frame: &Frame<'_>| {
         decoder.frame(frame)
     })
     .unwrap();

@@ -152,7 +152,7 @@ fn mixed() -> Vec<u8> {
 
 #[test]
 fn mixed_groups_and_values_of_variable_length() {
-    let contents = mdf::read("m.mf4", &mixed()).unwrap();
+    let contents = mdf::read("m.mf4", None, &mixed()).unwrap();
     let mut frames = Vec::new();
     contents
         .frames
@@ -195,7 +195,7 @@ fn measured(byte: u32, bit: u8, bits: u32, data_type: u32, records: &[[u8; 20]])
 
 #[test]
 fn groups_tell_equal_names_apart() {
-    let contents = mdf::read("m.mf4", &measured(8, 0, 8, UNSIGNED, &[[0; 20]])).unwrap();
+    let contents = mdf::read("m.mf4", None, &measured(8, 0, 8, UNSIGNED, &[[0; 20]])).unwrap();
     let names: Vec<_> = contents
         .series
         .iter()
@@ -210,11 +210,11 @@ fn an_infinite_value_is_no_value_of_a_recording() {
     for (record, value) in records.iter_mut().zip([1.0, f32::NAN, f32::INFINITY]) {
         record[8..12].copy_from_slice(&value.to_le_bytes());
     }
-    let contents = mdf::read("m.mf4", &measured(8, 0, 32, FLOAT, &records)).unwrap();
+    let contents = mdf::read("m.mf4", None, &measured(8, 0, 32, FLOAT, &records)).unwrap();
     let why = "x (an infinite value in record 3)";
     assert_eq!(contents.left_out, [why, why]);
     // What is not a number is missing.
-    let contents = mdf::read("m.mf4", &measured(8, 0, 32, FLOAT, &records[..2])).unwrap();
+    let contents = mdf::read("m.mf4", None, &measured(8, 0, 32, FLOAT, &records[..2])).unwrap();
     assert!(contents.series[0].signals[0].values[1].is_nan());
 }
 
@@ -264,7 +264,7 @@ fn what_is_not_read_is_said() {
         ),
     ];
     for (file, kind, sentence) in cases {
-        let error = mdf::read("m.mf4", &file).unwrap_err();
+        let error = mdf::read("m.mf4", None, &file).unwrap_err();
         assert_eq!(error.kind(), kind);
         assert!(error.to_string().ends_with(sentence), "{error}");
     }
@@ -285,7 +285,7 @@ fn channels_that_share_their_members_are_damage() {
     let group = maker.group(0, members, [0, 1, 0, 8]);
     let data = maker.block("DT", &[], &[0; 8]);
     let data_group = maker.block("DG", &[0, group, data, 0], &[0; 8]);
-    let error = mdf::read("m.mf4", &maker.finish(data_group)).unwrap_err();
+    let error = mdf::read("m.mf4", None, &maker.finish(data_group)).unwrap_err();
     assert!(
         error
             .to_string()
@@ -302,7 +302,7 @@ fn data_that_is_listed_twice_is_damage() {
     let data = maker.block("DT", &[], &[0; 8]);
     let list = maker.block("DL", &[0, data, data], &[0; 16]);
     let data_group = maker.block("DG", &[0, group, list, 0], &[0; 8]);
-    let error = mdf::read("m.mf4", &maker.finish(data_group)).unwrap_err();
+    let error = mdf::read("m.mf4", None, &maker.finish(data_group)).unwrap_err();
     assert!(
         error
             .to_string()
@@ -316,7 +316,7 @@ fn time_must_not_run_backwards() {
     let mut records = [[0; 20]; 2];
     records[0][..8].copy_from_slice(&2.0_f64.to_le_bytes());
     records[1][..8].copy_from_slice(&1.0_f64.to_le_bytes());
-    let error = mdf::read("m.mf4", &measured(8, 0, 8, UNSIGNED, &records)).unwrap_err();
+    let error = mdf::read("m.mf4", None, &measured(8, 0, 8, UNSIGNED, &records)).unwrap_err();
     assert_eq!(
         error.to_string(),
         "m.mf4, row 2, column group: t: found 1 s, expected a time not before the last record's 2 s"
@@ -337,7 +337,7 @@ proptest! {
         let mut record = [0; 20];
         record[8..19].copy_from_slice(&rest);
         let data_type = u32::from(motorola) + 2 * u32::from(signed);
-        let contents = mdf::read("m.mf4", &measured(byte, bit, bits, data_type, &[record])).unwrap();
+        let contents = mdf::read("m.mf4", None, &measured(byte, bit, bits, data_type, &[record])).unwrap();
         let length = (u32::from(bit) + bits).div_ceil(8) as usize;
         let mut bytes = record[byte as usize..byte as usize + length].to_vec();
         if motorola {
@@ -369,7 +369,7 @@ proptest! {
         if cut {
             file.truncate(length);
         }
-        match mdf::read("m.mf4", &file) {
+        match mdf::read("m.mf4", None, &file) {
             Ok(contents) => {
                 for series in contents.series {
                     for signal in series.signals {

@@ -3,11 +3,16 @@
 
 use std::io::BufRead;
 
-use super::{CLASSIC_BYTES, Counts, DATA_BYTES, Frame, Lines, Sink, fits, seconds_to_ns};
+use super::{CLASSIC_BYTES, Counts, DATA_BYTES, Frame, Lines, Sink, fits, on, seconds_to_ns};
 use crate::error::{Error, Kind, Place, Result, quoted};
 
-/// Reads a log; times count from the start of its measurement.
-pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<Counts> {
+/// Reads a log; times count from the start of its measurement. Counted is what is on `wanted`.
+pub fn read(
+    source: &str,
+    wanted: Option<&str>,
+    reader: impl BufRead,
+    sink: &mut Sink<'_>,
+) -> Result<Counts> {
     let mut counts = Counts::default();
     let mut header = Header::default();
     let mut last_ns = 0_i64;
@@ -18,16 +23,16 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
             header.line(line);
             continue;
         }
-        let Some(radix) = header.radix else {
-            return Err(Error::new(
-                Kind::Format,
-                source,
-                Place::line(number),
         // Half a byte looks like a smaller one.
         if !ended {
             counts.cut += 1;
             continue;
         }
+        let Some(radix) = header.radix else {
+            return Err(Error::new(
+                Kind::Format,
+                source,
+                Place::line(number),
                 quoted(line),
                 "a header with \"base hex\" or \"base dec\" before the first event",
             ));
@@ -59,7 +64,7 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
                 fd,
             } => {
                 counts.frames += 1;
-                counts.fd += u64::from(fd);
+                counts.fd += u64::from(fd) * on(wanted, bus);
                 sink(&Frame {
                     time_ns,
                     bus,
@@ -70,9 +75,10 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
                     place: Place::line(number),
                 })?;
             }
-            Read::Remote => counts.remote += 1,
-            Read::Error => counts.errors += 1,
-            Read::Other => counts.others += 1,
+            Read::Remote(bus) => counts.remote += on(wanted, bus),
+            Read::Error(bus) => counts.errors += on(wanted, bus),
+            Read::Other(None) => counts.others += 1,
+            Read::Other(Some(bus)) => counts.others += on(wanted, bus),
         }
     }
     if header.radix.is_none() {
@@ -129,9 +135,10 @@ enum Read<'a> {
         data: [u8; DATA_BYTES],
         fd: bool,
     },
-    Remote,
-    Error,
-    Other,
+    Remote(&'a str),
+    Error(&'a str),
+    /// Some name no bus.
+    Other(Option<&'a str>),
 }
 
 impl<'a> Event<'a> {
@@ -146,22 +153,22 @@ impl<'a> Event<'a> {
             return self.fd_frame(radix);
         }
         if !bus.bytes().all(|byte| byte.is_ascii_digit()) {
-            return Ok(Read::Other);
+            return Ok(Read::Other(None));
         }
         let identifier = self.next();
         if identifier.eq_ignore_ascii_case("errorframe") {
-            return Ok(Read::Error);
+            return Ok(Read::Error(bus));
         }
         let id_field = self.field;
         let direction = self.next();
         if !direction.eq_ignore_ascii_case("rx") && !direction.eq_ignore_ascii_case("tx") {
             // Statistics, transmit requests, transport protocols.
-            return Ok(Read::Other);
+            return Ok(Read::Other(Some(bus)));
         }
         let (id, extended) = self.identifier(identifier, id_field, radix)?;
         let kind = self.next();
         if kind.eq_ignore_ascii_case("r") {
-            return Ok(Read::Remote);
+            return Ok(Read::Remote(bus));
         }
         if !kind.eq_ignore_ascii_case("d") {
             return Err(self.fault(kind, "d for data or r for a remote frame"));
@@ -190,7 +197,7 @@ impl<'a> Event<'a> {
         const FD: u32 = 0x1000;
         let (bus, _direction, identifier) = (self.next(), self.next(), self.next());
         if identifier.eq_ignore_ascii_case("errorframe") {
-            return Ok(Read::Error);
+            return Ok(Read::Error(bus));
         }
         let (id, extended) = self.identifier(identifier, self.field, radix)?;
         if !matches!(self.next(), "0" | "1") {
@@ -209,7 +216,7 @@ impl<'a> Event<'a> {
         let (_duration, _bits) = (self.next(), self.next());
         let flags = number(self.next(), 16);
         if flags.is_some_and(|flags| flags & REMOTE != 0) {
-            return Ok(Read::Remote);
+            return Ok(Read::Remote(bus));
         }
         Ok(Read::Data {
             bus,

@@ -8,7 +8,7 @@ use std::io::{self, BufRead, Read};
 
 use flate2::bufread::ZlibDecoder;
 
-use super::{CLASSIC_BYTES, Counts, DATA_BYTES, Frame, Sink, fits, reading};
+use super::{CLASSIC_BYTES, Counts, DATA_BYTES, Frame, Sink, fits, on, reading};
 use crate::error::{Error, Kind, Place, Result, quoted};
 
 const FILE_MARK: &[u8; 4] = b"LOGG";
@@ -33,8 +33,13 @@ mod object {
     pub const CAN_FD_ERROR_64: u32 = 104;
 }
 
-/// Reads a log; times count from the start of its measurement.
-pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<Counts> {
+/// Reads a log; times count from the start of its measurement. Counted is what is on `wanted`.
+pub fn read(
+    source: &str,
+    wanted: Option<&str>,
+    reader: impl BufRead,
+    sink: &mut Sink<'_>,
+) -> Result<Counts> {
     let mut file = File {
         source,
         reader,
@@ -43,6 +48,7 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
     file.header()?;
     let mut objects = Objects {
         source,
+        wanted,
         counts: Counts::default(),
         pending: Vec::new(),
         bus: String::new(),
@@ -69,6 +75,7 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
             ));
         }
         let body = file.bytes(size - BASE_HEADER)?;
+        // Of a container that is cut, the objects that are whole.
         if body.len() < size - BASE_HEADER {
             if le32(&base, 12) == object::CONTAINER {
                 objects.pending.extend_from_slice(&start_of(&body));
@@ -80,7 +87,6 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
         // So many bytes follow each object, whatever its alignment.
         file.bytes(size % 4)?;
         if le32(&base, 12) == object::CONTAINER {
-        // Of a container that is cut, the objects that are whole.
             let inside = file.container(offset, &body)?;
             objects.pending.extend_from_slice(&inside);
         } else {
@@ -171,12 +177,6 @@ impl<R: BufRead> File<'_, R> {
     }
 }
 
-fn inflate(packed: &[u8], size: usize) -> io::Result<Vec<u8>> {
-    let mut bytes = Vec::new();
-    ZlibDecoder::new(packed)
-        .take(size as u64 + 1)
-        .read_to_end(&mut bytes)?;
-    if bytes.len() == size {
 /// As much of a container's contents as the part of it that is there gives.
 fn start_of(body: &[u8]) -> Vec<u8> {
     let Some((header, packed)) = body.split_at_checked(CONTAINER_HEADER) else {
@@ -193,6 +193,12 @@ fn start_of(body: &[u8]) -> Vec<u8> {
     bytes
 }
 
+fn inflate(packed: &[u8], size: usize) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    ZlibDecoder::new(packed)
+        .take(size as u64 + 1)
+        .read_to_end(&mut bytes)?;
+    if bytes.len() == size {
         Ok(bytes)
     } else {
         Err(io::Error::other(format!(
@@ -205,6 +211,7 @@ fn start_of(body: &[u8]) -> Vec<u8> {
 /// Objects as they come out of the containers.
 struct Objects<'a> {
     source: &'a str,
+    wanted: Option<&'a str>,
     counts: Counts,
     /// Not taken yet: the last object may go on in the next container.
     pending: Vec<u8>,
@@ -250,7 +257,14 @@ impl Objects<'_> {
         let kind = le32(object, 12);
         match kind {
             object::CAN_ERROR | object::CAN_ERROR_EXT | object::CAN_FD_ERROR_64 => {
-                self.counts.errors += 1;
+                let start = usize::from(le16(object, 4));
+                let channel = match kind {
+                    object::CAN_FD_ERROR_64 => {
+                        u16::from(object.get(start).copied().unwrap_or_default())
+                    }
+                    _ => le16(object, start),
+                };
+                self.counts.errors += on(self.wanted, &channel.to_string());
                 return Ok(());
             }
             object::CAN_MESSAGE
@@ -285,7 +299,7 @@ impl Objects<'_> {
             ));
         }
         if message.remote {
-            self.counts.remote += 1;
+            self.counts.remote += on(self.wanted, &message.channel.to_string());
             return Ok(());
         }
         let mut data = [0; DATA_BYTES];
@@ -300,8 +314,8 @@ impl Objects<'_> {
             .ok_or_else(short)?;
         data[..length].copy_from_slice(bytes);
         self.counts.frames += 1;
-        self.counts.fd += u64::from(message.fd);
         self.bus = message.channel.to_string();
+        self.counts.fd += u64::from(message.fd) * on(self.wanted, &self.bus);
         sink(&Frame {
             time_ns,
             bus: &self.bus,

@@ -4,14 +4,19 @@
 
 use std::io::BufRead;
 
-use super::{CLASSIC_BYTES, Counts, DATA_BYTES, Frame, Lines, Sink, fits, seconds_to_ns};
+use super::{CLASSIC_BYTES, Counts, DATA_BYTES, Frame, Lines, Sink, fits, on, seconds_to_ns};
 use crate::error::{Error, Kind, Place, Result, quoted};
 
 /// Set in the identifier of an error frame (`CAN_ERR_FLAG` of linux/can.h).
 const ERROR_FLAG: u32 = 0x2000_0000;
 
-/// Reads a log; times are those of the logging computer's clock, since 1970.
-pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<Counts> {
+/// Reads a log; times are those of the logging computer's clock, since 1970. Counted is what is on `wanted`.
+pub fn read(
+    source: &str,
+    wanted: Option<&str>,
+    reader: impl BufRead,
+    sink: &mut Sink<'_>,
+) -> Result<Counts> {
     let mut counts = Counts::default();
     let mut lines = Lines::new(source, reader);
     while let Some((number, line, ended)) = lines.next()? {
@@ -60,7 +65,7 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
             .and_then(|id| u32::from_str_radix(id, 16).ok())
             .ok_or_else(|| wrong("an identifier of 3 or 8 hexadecimal digits"))?;
         if extended && id & ERROR_FLAG != 0 {
-            counts.errors += 1;
+            counts.errors += on(wanted, bus);
             continue;
         }
         if !fits(id, extended) {
@@ -75,7 +80,7 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
             {
                 return Err(wrong("R and a length"));
             }
-            counts.remote += 1;
+            counts.remote += on(wanted, bus);
             continue;
         }
         let (bytes, length) = match fd {
@@ -89,7 +94,7 @@ pub fn read(source: &str, reader: impl BufRead, sink: &mut Sink<'_>) -> Result<C
                 .ok_or_else(|| wrong("up to eight bytes of two hexadecimal digits after #"))?,
         };
         counts.frames += 1;
-        counts.fd += u64::from(fd.is_some());
+        counts.fd += u64::from(fd.is_some()) * on(wanted, bus);
         sink(&Frame {
             time_ns,
             bus,

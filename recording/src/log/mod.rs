@@ -32,7 +32,8 @@ pub struct Frame<'a> {
     pub place: Place,
 }
 
-/// What a log held besides its data frames: counted, since it carries no signals.
+/// What a log held besides its data frames: counted, since it carries no signals. Where one bus is asked for, what others carry
+/// is in none but `frames`; an event that names no bus is of any.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
     /// Data frames.
@@ -49,7 +50,12 @@ pub struct Counts {
     pub cut: u64,
 }
 
-/// Takes the frames of a log one by one.
+/// 1 for something on a bus that is asked for, to be counted; no bus asked for is any.
+pub(crate) fn on(wanted: Option<&str>, bus: &str) -> u64 {
+    u64::from(wanted.is_none_or(|wanted| wanted == bus))
+}
+
+/// Takes the frames of a log one by one, of every bus.
 pub type Sink<'a> = dyn FnMut(&Frame<'_>) -> Result<()> + 'a;
 
 /// Lines of a text log; bytes that are not UTF-8 (comments, month names) are replaced.

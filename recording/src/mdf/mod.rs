@@ -75,8 +75,9 @@ impl Frames {
     }
 }
 
-/// Reads a file from memory; `source` is what messages call it. Times count from the start of its measurement.
-pub fn read(source: &str, bytes: &[u8]) -> Result<Contents> {
+/// Reads a file from memory; `source` is what messages call it. Times count from the start of its measurement. Of logged frames,
+/// what is on the bus `wanted` is counted.
+pub fn read(source: &str, wanted: Option<&str>, bytes: &[u8]) -> Result<Contents> {
     let file = File {
         source,
         bytes,
@@ -98,7 +99,7 @@ pub fn read(source: &str, bytes: &[u8]) -> Result<Contents> {
     let mut names = Vec::new();
     for block in file.chain(header.link(0), b"DG")? {
         for group in groups(&file, &block)? {
-            group.read(&file, &mut contents, &mut names)?;
+            group.read(&file, wanted, &mut contents, &mut names)?;
         }
     }
     distinguish(&mut contents.series, &names);
@@ -395,6 +396,7 @@ impl Group<'_> {
     fn read(
         &self,
         file: &File<'_>,
+        wanted: Option<&str>,
         contents: &mut Contents,
         names: &mut Vec<String>,
     ) -> Result<()> {
@@ -413,11 +415,11 @@ impl Group<'_> {
             })
         };
         if bus("CAN_ErrorFrame") {
-            contents.counts.errors += self.records.len() as u64;
+            contents.counts.errors += self.events(file, &channels, "CAN_ErrorFrame", wanted)?;
             return Ok(());
         }
         if bus("CAN_RemoteFrame") {
-            contents.counts.remote += self.records.len() as u64;
+            contents.counts.remote += self.events(file, &channels, "CAN_RemoteFrame", wanted)?;
             return Ok(());
         }
         let time = channels.iter().find(|channel| {
@@ -429,7 +431,7 @@ impl Group<'_> {
         };
         let time_s = self.times(file, time, &name)?;
         if bus("CAN_DataFrame") {
-            return self.frames(file, &channels, &time_s, contents);
+            return self.frames(file, &channels, &time_s, wanted, contents);
         }
         let mut signals = Vec::new();
         let flat = channels.iter().flat_map(|channel| {
@@ -548,24 +550,35 @@ impl Group<'_> {
         Ok(time_s)
     }
 
+    /// How many frames a group of logged ones without data holds of the bus `wanted`.
+    fn events(
+        &self,
+        file: &File<'_>,
+        channels: &[Channel<'_>],
+        kind: &str,
+        wanted: Option<&str>,
+    ) -> Result<u64> {
+        let bus = member(channels, &format!("{kind}."), "BusChannel");
+        let (Some(bus), Some(_)) = (bus, wanted) else {
+            // As of frames without this channel.
+            return Ok(self.records.len() as u64 * log::on(wanted, "0"));
+        };
+        self.records().try_fold(0, |count, (record, _)| {
+            let number = bus.raw_bits(record).ok_or_else(|| outside(file, bus))?;
+            Ok(count + log::on(wanted, &number.to_string()))
+        })
+    }
+
     /// The frames of a group of logged CAN data frames (ASAM MDF 4.1, bus logging).
     fn frames(
         &self,
         file: &File<'_>,
         channels: &[Channel<'_>],
         time_s: &[f64],
+        wanted: Option<&str>,
         contents: &mut Contents,
     ) -> Result<()> {
-        let member = |wanted: &str| {
-            let all = channels
-                .iter()
-                .flat_map(|channel| channel.members.iter().chain([channel]));
-            let mut all = all.filter(|channel| {
-                let name = channel.name.strip_prefix("CAN_DataFrame.");
-                name.unwrap_or(&channel.name) == wanted
-            });
-            all.next()
-        };
+        let member = |name: &str| member(channels, "CAN_DataFrame.", name);
         let need = |wanted: &str| {
             member(wanted).ok_or_else(|| {
                 file.fault(
@@ -605,7 +618,9 @@ impl Group<'_> {
                     "at most 64",
                 ));
             }
-            contents.counts.fd += u64::from(fd || length > CLASSIC_BYTES);
+            let channel = optional(bus, record)?;
+            contents.counts.fd +=
+                u64::from(fd || length > CLASSIC_BYTES) * log::on(wanted, &channel.to_string());
             let raw = number(id, record)?;
             // Some loggers mark 29 bits in the identifier itself.
             let extended = optional(ide, record)? != 0 || raw >> 31 & 1 != 0;
@@ -629,7 +644,7 @@ impl Group<'_> {
             let time_ns = (time_s * 1e9).round() as i64;
             contents.frames.0.push(Logged {
                 time_ns,
-                bus: optional(bus, record)?,
+                bus: channel,
                 id,
                 extended,
                 length,
@@ -639,6 +654,14 @@ impl Group<'_> {
         }
         Ok(())
     }
+}
+
+/// The channel of this name, or the member of one, with `prefix` before it or without.
+fn member<'a>(channels: &'a [Channel<'a>], prefix: &str, name: &str) -> Option<&'a Channel<'a>> {
+    let mut all = channels
+        .iter()
+        .flat_map(|channel| channel.members.iter().chain([channel]));
+    all.find(|channel| channel.name.strip_prefix(prefix).unwrap_or(&channel.name) == name)
 }
 
 fn outside(file: &File<'_>, channel: &Channel<'_>) -> Error {
