@@ -696,7 +696,8 @@ BA_ "E2EDataId" BO_ 16 16;
 #[test]
 fn frames_that_are_not_as_they_were_sent_are_left_out() {
     let good = board_frame(0x101, 3, &[(32, 1500)]);
-    let (recording, decoded) = decode_with(BOARD, &board_log(&[good.clone()]), None).unwrap();
+    let (recording, decoded) =
+        decode_with(BOARD, &board_log(std::slice::from_ref(&good)), None).unwrap();
     assert_eq!(column(&recording, "i_meas_a"), [1.5]);
     assert_eq!((decoded.frames, decoded.broken), (1, 0));
     let mut frames = vec![good.clone()];
