@@ -4,6 +4,10 @@
 //! 2. Rate: the best offset of each of several blocks, and a line through them.
 //! 3. Fine: least squares over offset, rate and a smoothing of the reference (a first-order lag or a moving average,
 //!    whichever fits better), with gain and zero solved within. Without the smoothing a lag would be taken for a shift.
+//! 4. Wider: the coarse search once for each of many rates, as a clock that runs 1 % fast has no offset at which all of a
+//!    recording fits; where another rate than a crystal's is likelier, 1 to 3 again from there, and the better fit counts.
+//! 5. Chance: among thousands of offsets and a hundred rates one suits any two recordings somewhat. Where the values are little
+//!    alike, each part of the sensor's blocks has to fit where the others say.
 //!
 //! The reference's own noise is evened out by smoothing, and between two of its rows: the squares are lower there whatever the clocks are.
 //! What its standstills show of it is taken out of them again (least squares compensated for the noise of what goes in; Söderström 2018,
@@ -22,12 +26,34 @@ const LEAST_OVERLAP: f64 = 0.25;
 const LEAST_CORRELATION: f64 = 0.2;
 /// … unless it stands out by this many times the rms over all offsets.
 const STANDS_OUT: f64 = 6.0;
+/// Correlation of the values themselves from which on no more is asked.
+const SURE_CORRELATION: f64 = 0.95;
+/// Parts of the sensor's blocks, each of which has to fit where the others say.
+const PARTS: usize = 4;
+/// Points of the grids on which they are compared.
+const HELD_GRIDS: [usize; 3] = [1024, 256, 64];
+/// Correlation of the derivatives of the parts that are left out, which is no chance, …
+const HELD_CORRELATION: f64 = 0.55;
+/// … or so many times the rms over all offsets: it is one place of each part, not the best of thousands.
+const HELD_STANDS_OUT: f64 = 4.5;
+/// Parts of a recording in which it has to move before a rate is believed that no crystal has: a rate suits any two edges.
+const PARTS_TO_MOVE: f64 = 3.0;
 /// Correlation of the values themselves that is no chance among thousands of offsets.
 const SCAN_CORRELATION: f64 = 0.6;
-/// Fastest clock error that is looked for, in 1: crystals are within 100 ppm, cheap loggers within 500.
+/// Fastest clock error that is looked for first, in 1: crystals are within 100 ppm, cheap loggers within 500.
 const FASTEST_RATE: f64 = 500e-6;
 /// No clock is that wrong, in 1: it is another unit of time, or another file.
 const WRONG_RATE: f64 = 0.02;
+/// Rates are looked for beyond that, in 1, so that what is refused can be told.
+const SCANNED_RATE: f64 = 2.5 * WRONG_RATE;
+/// Cells of the shorter signal on the grid of that search: its rates are a cell apart at the far end.
+const SCAN_CELLS: f64 = 1024.0;
+/// Cells of the longer signal there, at most: the cost grows with both.
+const SCAN_CELLS_OF_LONGER: f64 = 8192.0;
+/// A search that ended within this share of the farthest drift it allows was ended by it.
+const AT_LIMIT: f64 = 0.98;
+/// Times that a search which ended at its limit is gone on with from there.
+const GO_ON: usize = 3;
 /// Readings that the fine fit uses at most.
 const FIT_ROWS: usize = 20_000;
 /// Beyond this share of the signal's spread a residual counts in proportion and not squared.
@@ -67,6 +93,18 @@ impl Signal {
             (Some(first), Some(last)) => last - first,
             _ => 0.0,
         }
+    }
+
+    /// The same values, if so much more passes between two of them, in 1.
+    fn at_rate(&self, rate: f64) -> Self {
+        let start_s = self.t_s.first().copied().unwrap_or(0.0);
+        let mut signal = self.clone();
+        if rate != 0.0 {
+            for t_s in &mut signal.t_s {
+                *t_s = start_s + (*t_s - start_s) * (1.0 + rate);
+            }
+        }
+        signal
     }
 
     fn step_s(&self) -> f64 {
@@ -128,6 +166,124 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
             sensed.t_s.len()
         ));
     }
+    let near = search(driven, sensed, 0.0);
+    // With rows so far apart that the first search comes that far, they are another unit of time, whatever is alike.
+    if let Some(near) = near.filter(|near| near.is_alike() && near.rate.abs() > WRONG_RATE) {
+        return Err(wrong_rate(near.rate));
+    }
+    let found = match (near, wider(driven, sensed, near.as_ref())) {
+        (Some(near), Some(wide)) if wide.is_clearly_better(&near) => wide,
+        (None, Some(wide)) => wide,
+        (Some(near), _) => near,
+        (None, None) => return Err(nothing_in_common(driven, sensed, None)),
+    };
+    let is_sure = found.correlation.abs() >= SURE_CORRELATION;
+    if !found.is_alike() || !is_sure && !holds(driven, &sensed.at_rate(found.rate)) {
+        return Err(nothing_in_common(driven, sensed, Some(found.correlation)));
+    }
+    if found.rate.abs() > WRONG_RATE {
+        return Err(wrong_rate(found.rate));
+    }
+    Ok(Alignment {
+        offset_s: found.offset_s,
+        fast_ppm: (1.0 / (1.0 + found.rate) - 1.0) * 1e6,
+        start_s: sensed.t_s.first().copied().unwrap_or(0.0),
+        correlation: found.correlation,
+    })
+}
+
+/// What a search found.
+#[derive(Clone, Copy, Debug)]
+struct Found {
+    offset_s: f64,
+    /// By how much more passes on the reference's clock than on the sensor's, in 1.
+    rate: f64,
+    cost: f64,
+    correlation: f64,
+    /// It ended at the farthest drift that it allows.
+    at_limit: bool,
+    /// Share by which the mean square of so many readings is seldom off.
+    seldom: f64,
+}
+
+impl Found {
+    fn is_alike(&self) -> bool {
+        self.correlation.abs() >= LEAST_CORRELATION
+    }
+
+    /// Rates beyond a crystal's are seldom: a fit that is better by chance does not speak for one, unless the other fit was not free
+    /// to be better.
+    fn is_clearly_better(&self, near: &Self) -> bool {
+        let least = if near.at_limit {
+            near.cost
+        } else {
+            near.cost - near.seldom * near.cost.abs()
+        };
+        self.cost < least && self.correlation.abs() >= near.correlation.abs()
+    }
+}
+
+/// The best fit from the likeliest rate that the search near 0 does not reach; `None` if that search found what it should.
+fn wider(driven: &Signal, sensed: &Signal, near: Option<&Found>) -> Option<Found> {
+    let grid_s = scan_grid_s(driven, sensed);
+    if parts_that_move(&derivative(sensed, grid_s)) < PARTS_TO_MOVE {
+        return None;
+    }
+    let (at_none, scores) = scores_of_rates(driven, sensed, grid_s)?;
+    let (score, rate) = scores
+        .into_iter()
+        .max_by(|one, other| one.0.total_cmp(&other.0))?;
+    if score <= at_none && near.is_some_and(|near| !near.at_limit) {
+        return None;
+    }
+    let mut found = search(driven, sensed, rate)?;
+    for _ in 0..GO_ON {
+        if !found.at_limit || found.rate.abs() > SCANNED_RATE {
+            break;
+        }
+        match search(driven, sensed, found.rate) {
+            Some(further) if further.cost < found.cost => found = further,
+            _ => break,
+        }
+    }
+    Some(found)
+}
+
+fn scan_grid_s(driven: &Signal, sensed: &Signal) -> f64 {
+    let (one_s, other_s) = (driven.span_s(), sensed.span_s());
+    (one_s.min(other_s) / SCAN_CELLS)
+        .max(one_s.max(other_s) / SCAN_CELLS_OF_LONGER)
+        .max(driven.step_s().min(sensed.step_s()))
+        .max(1e-9)
+}
+
+/// The highest correlation of the derivatives among all offsets: at rate 0, and at each rate of a grid with the rate.
+fn scores_of_rates(
+    driven: &Signal,
+    sensed: &Signal,
+    grid_s: f64,
+) -> Option<(f64, Vec<(f64, f64)>)> {
+    let apart = grid_s / driven.span_s().min(sensed.span_s()).max(grid_s);
+    let x = derivative(driven, grid_s);
+    let score = |rate: f64| {
+        let y = derivative(&sensed.at_rate(rate), grid_s);
+        highest(&scores(&x, &y)).map(|(score, _)| score.abs())
+    };
+    let at_none = score(0.0)?;
+    let tries = (SCANNED_RATE / apart).ceil() as i32;
+    let rates = (-tries..=tries).filter(|index| *index != 0);
+    let rates = rates.map(|index| f64::from(index) * apart);
+    Some((
+        at_none,
+        rates
+            .filter_map(|rate| Some((score(rate)?, rate)))
+            .collect(),
+    ))
+}
+
+/// The best fit of rates near one that is given; `None` if there is no offset at which the two are alike.
+fn search(driven: &Signal, sensed: &Signal, rate: f64) -> Option<Found> {
+    let sensed = &sensed.at_rate(rate);
     let thin = thinned(sensed);
     let spread = spread(&thin.value).max(f64::MIN_POSITIVE);
     let seldom = SELDOM * (2.0 / thin.t_s.len() as f64).sqrt();
@@ -142,9 +298,7 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
         seldom,
     };
     let step_s = thin.step_s().max(driven.step_s()).max(1e-9);
-    let (coarse_s, grid_s) = coarse(driven, sensed)
-        .or_else(|| fit.scan(step_s))
-        .ok_or_else(|| nothing_in_common(driven, sensed))?;
+    let (coarse_s, grid_s) = coarse(driven, sensed).or_else(|| fit.scan(step_s))?;
     // Smoothing and offset by trial; the rate is still unknown, so only its middle matters.
     let mut best = Trial::worst();
     for shape in [Shape::Lag, Shape::Average] {
@@ -203,34 +357,38 @@ pub fn estimate(driven: &Signal, sensed: &Signal) -> Result<Alignment, String> {
     }
     fine.take(fit.descend(fine, 0.05 * step_s));
     let smooth = fit.smooth(fine.shape, fine.smoothing_s);
-    let correlation = fit.correlation(&smooth.value, fine.offset_s, fine.drift_s);
-    if correlation.abs() < LEAST_CORRELATION {
-        return Err(nothing_in_common(driven, sensed));
-    }
-    let rate = fine.drift_s / fit.span_s;
-    if rate.abs() > WRONG_RATE {
-        return Err(format!(
-            "found clocks that differ in rate by {:.1} %, expected less than {:.0} %: the unit of time of one file is likely \
-             wrong (t_s is in s), or they are not of the same run",
-            100.0 * rate.abs(),
-            100.0 * WRONG_RATE
-        ));
-    }
-    Ok(Alignment {
+    // Not (1 + rate)·(1 + own) − 1, which leaves fewer digits of a small one.
+    let own = fine.drift_s / fit.span_s;
+    Some(Found {
         offset_s: fine.offset_s,
-        fast_ppm: (1.0 / (1.0 + rate) - 1.0) * 1e6,
-        start_s: fit.start_s,
-        correlation,
+        rate: own + rate * (1.0 + own),
+        cost: fine.cost,
+        correlation: fit.correlation(&smooth.value, fine.offset_s, fine.drift_s),
+        at_limit: fine.drift_s.abs() > AT_LIMIT * fit.farthest_s(step_s),
+        seldom,
     })
 }
 
-fn nothing_in_common(driven: &Signal, sensed: &Signal) -> String {
+fn wrong_rate(rate: f64) -> String {
+    format!(
+        "found clocks that differ in rate by {:.1} %, expected less than {:.0} %: the unit of time of one file is likely \
+         wrong (t_s is in s), or they are not of the same run",
+        100.0 * rate.abs(),
+        100.0 * WRONG_RATE
+    )
+}
+
+fn nothing_in_common(driven: &Signal, sensed: &Signal, correlation: Option<f64>) -> String {
     let span = |signal: &Signal| match (signal.t_s.first(), signal.t_s.last()) {
         (Some(first), Some(last)) => format!("{} … {} s", number(*first), number(*last)),
         _ => "no time".to_owned(),
     };
+    let best = correlation.map_or(String::new(), |correlation| {
+        format!(" beyond chance (correlation {correlation:.2} at best)")
+    });
     format!(
-        "found no offset at which the sensor ({}) follows the reference ({}), expected recordings that overlap in time",
+        "found no offset and rate at which the sensor ({}) follows the reference ({}){best}, expected recordings of the same run \
+         that overlap in time",
         span(sensed),
         span(driven)
     )
@@ -256,6 +414,35 @@ fn coarse(driven: &Signal, sensed: &Signal) -> Option<(f64, f64)> {
 fn correlate(driven: &Signal, sensed: &Signal, grid_s: f64) -> Option<(f64, f64)> {
     let x = derivative(driven, grid_s);
     let y = derivative(sensed, grid_s);
+    let scores = scores(&x, &y);
+    let (best, lag) = highest(&scores)?;
+    // Chance alone reaches about 1/√n, and the largest of many tries some times that.
+    let chance = STANDS_OUT / (x.len().min(y.len()) as f64).sqrt();
+    if best.abs() < LEAST_CORRELATION.max(chance.min(0.7)) && best.abs() < STANDS_OUT * rms(&scores)
+    {
+        return None;
+    }
+    let origin = |signal: &Signal| signal.t_s.first().copied().unwrap_or(0.0);
+    Some((
+        best.abs(),
+        origin(driven) - origin(sensed) + lag as f64 * grid_s,
+    ))
+}
+
+fn highest(scores: &[(f64, isize)]) -> Option<(f64, isize)> {
+    scores
+        .iter()
+        .copied()
+        .max_by(|one, other| one.0.abs().total_cmp(&other.0.abs()))
+}
+
+fn rms(scores: &[(f64, isize)]) -> f64 {
+    let total: f64 = scores.iter().map(|(score, _)| score * score).sum();
+    (total / scores.len() as f64).sqrt()
+}
+
+/// The correlation of one series with another, `y[k]` beside `x[k + lag]`, at every lag at which enough overlaps.
+fn scores(x: &[f64], y: &[f64]) -> Vec<(f64, isize)> {
     let shorter = x.len().min(y.len());
     let least = ((shorter as f64 * LEAST_OVERLAP) as usize).max(8);
     let squares = |values: &[f64]| -> Vec<f64> {
@@ -267,9 +454,8 @@ fn correlate(driven: &Signal, sensed: &Signal, grid_s: f64) -> Option<(f64, f64)
         }));
         all
     };
-    let (squares_x, squares_y) = (squares(&x), squares(&y));
+    let (squares_x, squares_y) = (squares(x), squares(y));
     let mut scores = Vec::new();
-    // y[k] beside x[k + lag].
     let (first, last) = (-(y.len() as isize), x.len() as isize);
     for lag in first..=last {
         let from = (-lag).max(0) as usize;
@@ -293,22 +479,71 @@ fn correlate(driven: &Signal, sensed: &Signal, grid_s: f64) -> Option<(f64, f64)
         let share = (length as f64 / shorter as f64).min(1.0).sqrt();
         scores.push((product / energy.sqrt() * share, lag));
     }
-    let (best, lag) = scores
-        .iter()
-        .copied()
-        .max_by(|one, other| one.0.abs().total_cmp(&other.0.abs()))?;
-    let total: f64 = scores.iter().map(|(score, _)| score * score).sum();
-    let rms = (total / scores.len() as f64).sqrt();
-    // Chance alone reaches about 1/√n, and the largest of many tries some times that.
-    let chance = STANDS_OUT / (shorter as f64).sqrt();
-    if best.abs() < LEAST_CORRELATION.max(chance.min(0.7)) && best.abs() < STANDS_OUT * rms {
-        return None;
+    scores
+}
+
+/// Whether each part of the sensor's blocks fits the reference where all the others have their best fit: one place to look at
+/// instead of thousands, at which chance is rarely alike.
+fn holds(driven: &Signal, sensed: &Signal) -> bool {
+    let longest_s = driven.span_s().max(sensed.span_s());
+    let finest_s = driven.step_s().min(sensed.step_s());
+    HELD_GRIDS.iter().any(|grid| {
+        let grid_s = (longest_s / *grid as f64).max(finest_s).max(1e-9);
+        held_out(&derivative(driven, grid_s), &derivative(sensed, grid_s))
+            .is_some_and(|(held, rms)| held > HELD_CORRELATION || held > HELD_STANDS_OUT * rms)
+    })
+}
+
+/// The correlation of the parts of `y`, each at the lag (or one beside it) that is best for all the others, and the rms of all lags.
+fn held_out(x: &[f64], y: &[f64]) -> Option<(f64, f64)> {
+    let parts: Vec<Vec<(f64, isize)>> = (0..PARTS)
+        .map(|part| {
+            let own = |cell: usize| 2 * BLOCKS * cell / y.len() % PARTS == part;
+            let kept = y.iter().enumerate();
+            let kept = kept.map(|(cell, value)| if own(cell) { *value } else { 0.0 });
+            scores(x, &kept.collect::<Vec<f64>>())
+        })
+        .collect();
+    // Every part has its score at a lag that counts.
+    let lags = parts[0].iter().filter_map(|(_, lag)| {
+        let at = |part: &Vec<(f64, isize)>| {
+            let index = part.binary_search_by_key(lag, |(_, lag)| *lag).ok()?;
+            Some(part[index].0)
+        };
+        parts.iter().map(at).collect::<Option<Vec<f64>>>()
+    });
+    let lags: Vec<Vec<f64>> = lags.collect();
+    // A part has its share of the energy of y beside all that of x.
+    let whole = (PARTS as f64).sqrt() / PARTS as f64;
+    let sum = |at_lag: &Vec<f64>| at_lag.iter().sum::<f64>() * whole;
+    let squares: f64 = lags.iter().map(|at_lag| sum(at_lag).powi(2)).sum();
+    let mut held = 0.0;
+    for part in 0..PARTS {
+        let of_others = lags.iter().map(|at_lag| sum(at_lag) - at_lag[part] * whole);
+        let (at, best) = of_others
+            .enumerate()
+            .max_by(|one, other| one.1.abs().total_cmp(&other.1.abs()))?;
+        let beside = &lags[at.saturating_sub(1)..(at + 2).min(lags.len())];
+        let own = beside.iter().map(|at_lag| at_lag[part] * best.signum());
+        held += own.fold(f64::NEG_INFINITY, f64::max) * whole;
     }
-    let origin = |signal: &Signal| signal.t_s.first().copied().unwrap_or(0.0);
-    Some((
-        best.abs(),
-        origin(driven) - origin(sensed) + lag as f64 * grid_s,
-    ))
+    Some((held, (squares / lags.len() as f64).sqrt()))
+}
+
+/// In how many parts of equal length a series moves as much: 1 if all of it moves in one of them.
+fn parts_that_move(derivative: &[f64]) -> f64 {
+    let length = derivative.len().div_ceil(2 * BLOCKS).max(1);
+    let energy = derivative
+        .chunks(length)
+        .map(|part| part.iter().map(|value| value * value).sum::<f64>());
+    let (sum, squares) = energy.fold((0.0, 0.0), |(sum, squares), energy| {
+        (sum + energy, squares + energy * energy)
+    });
+    if squares > 0.0 {
+        sum * sum / squares
+    } else {
+        0.0
+    }
 }
 
 /// Differences of the means over the cells of a grid that begins at the first row.
@@ -681,13 +916,17 @@ impl Fit<'_> {
         Some((offset_s + starts[starts.len() / 2], slope * self.span_s))
     }
 
+    /// The farthest drift that is allowed.
+    fn farthest_s(&self, step_s: f64) -> f64 {
+        2.0 * FASTEST_RATE * self.span_s + step_s
+    }
+
     /// Nelder and Mead's simplex over offset, drift and smoothing.
     fn descend(&self, start: Trial, step_s: f64) -> Trial {
+        let farthest_s = self.farthest_s(step_s);
         let at = |point: [f64; 3]| {
             let smoothing_s = point[2].abs();
-            if smoothing_s > 0.3 * self.span_s
-                || point[1].abs() > 2.0 * FASTEST_RATE * self.span_s + step_s
-            {
+            if smoothing_s > 0.3 * self.span_s || point[1].abs() > farthest_s {
                 return f64::INFINITY;
             }
             let smooth = self.smooth(start.shape, smoothing_s);

@@ -389,6 +389,16 @@ impl<'a> Work<'a> {
             Some(value) => self.observe(&drive, &parts.rows, &parts.clocks, value, &fresh),
             None => (series::every_row(&drive), Arc::clone(&parts.rows)),
         };
+        if self.clock.is_some() && value.is_some() {
+            let left_out = series::leave_out_beside_steps(&drive, &mut observed);
+            if left_out > 0 {
+                self.remark(format!(
+                    "{} of {measured} left out: between the rows on either side the reference steps, and two clocks do not tell \
+                     whether before or after the reading",
+                    count(left_out, "reading")
+                ));
+            }
+        }
         if board.is_none() && sensor.interval_s == 0.0 {
             observed.held_s = fresh.interval_s.unwrap_or_default();
         }

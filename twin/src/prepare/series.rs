@@ -12,6 +12,11 @@ const SHORTEST_GAP_S: f64 = 5.0;
 /// … and than this many times either neighbouring step: a logger that slows down in a rest leaves no gap.
 const GAP_OF_NEIGHBOURS: f64 = 10.0;
 
+/// Rows of a reference are as coarse as readings from this share of the time between those on.
+const AS_COARSE: f64 = 0.5;
+/// A series steps where it moves by less than this share of the step before and after.
+const LEVEL: f64 = 0.05;
+
 /// A drive and where its rows are from.
 #[derive(Clone, Debug)]
 pub(super) struct DriveParts {
@@ -175,6 +180,51 @@ pub(super) fn own_rows(
     }
     observed.t_s = times_s.into();
     (observed, Arc::new(rows))
+}
+
+/// Leaves out the readings between two rows of a reference between which it steps, if those are as far apart as the readings: an
+/// edge lies anywhere between two rows of either clock, so nothing tells on which side of it such a reading is. Only those that
+/// show either side: what shows the way from one to the other is no edge. How many they are.
+pub(super) fn leave_out_beside_steps(drive: &Drive, observed: &mut Observed) -> usize {
+    let spacing_s = spacing_s(observed);
+    let (t_s, reference) = (&drive.t_s, &drive.reference);
+    let steps_at = |row: usize, inside: &Range<usize>| {
+        // Level before and after it: a slope goes on.
+        if row == inside.start || row + 2 >= inside.end {
+            return false;
+        }
+        let moved = |row: usize| (reference[row + 1] - reference[row]).abs();
+        t_s[row + 1] - t_s[row] >= AS_COARSE * spacing_s
+            && moved(row - 1).max(moved(row + 1)) < LEVEL * moved(row)
+    };
+    let shows_a_side = |observed: &Observed, reading: usize| {
+        let value = &observed.value;
+        if reading == 0 || reading + 1 >= value.len() {
+            return false;
+        }
+        let before = (value[reading] - value[reading - 1]).abs();
+        let after = (value[reading + 1] - value[reading]).abs();
+        before.min(after) < LEVEL * before.max(after)
+    };
+    let mut left_out = 0;
+    for reading in 0..observed.t_s.len() {
+        let Some(inside) = drive.segments.get(observed.segment_of(reading)) else {
+            continue;
+        };
+        let now_s = observed.t_s[reading];
+        let after = inside.start + t_s[inside.clone()].partition_point(|t| *t <= now_s);
+        // At a row the reference is known.
+        if observed.valid[reading]
+            && after > inside.start
+            && t_s[after - 1] < now_s
+            && steps_at(after - 1, inside)
+            && shows_a_side(observed, reading)
+        {
+            observed.valid[reading] = false;
+            left_out += 1;
+        }
+    }
+    left_out
 }
 
 /// Median time between readings that count, in s; 0 with fewer than two.
