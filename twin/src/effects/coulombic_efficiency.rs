@@ -42,9 +42,26 @@ impl Effect for CoulombicEfficiency {
         vec![vec![0.99]]
     }
 
+    fn unlikely(&self, values: &[f64]) -> Option<&'static str> {
+        (values[0] > 1.0).then_some("no more charge comes back than was put in")
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         if let Some(battery) = &mut scene.battery {
             battery.efficiency = values[0];
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn more_than_was_put_in_does_not_come_back() {
+        assert_eq!(CoulombicEfficiency.unlikely(&[0.99]), None);
+        assert_eq!(CoulombicEfficiency.unlikely(&[1.0]), None);
+        let why = CoulombicEfficiency.unlikely(&[1.002]);
+        assert_eq!(why, Some("no more charge comes back than was put in"));
     }
 }

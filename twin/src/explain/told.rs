@@ -440,27 +440,34 @@ pub(super) fn current_off(bench: &Workbench<'_>, selection: &Selection) -> Vec<(
         named.map(|named| &members[named.index])
     };
     let off = named().filter_map(|Member { effect, values }| {
-        let error = match effect.in_the_current(values, &bench.scale)? {
-            CurrentError::Offset(by_a) => format!(
-                "{} A too {} all along",
-                short(by_a.abs()),
-                if by_a > 0.0 { "high" } else { "low" }
-            ),
-            CurrentError::Gain(factor) => format!("{factor:.4} times the true one"),
-        };
         let id = effect.card().id;
-        Some(match effect.unlikely(values) {
-            Some(why) => (
-                format!("{why}: likelier than {id} is a recorded current that is {error}"),
-                true,
-            ),
-            None => (
+        let error = effect
+            .in_the_current(values, &bench.scale)
+            .map(|error| match error {
+                CurrentError::Offset(by_a) => format!(
+                    "{} A too {} all along",
+                    short(by_a.abs()),
+                    if by_a > 0.0 { "high" } else { "low" }
+                ),
+                CurrentError::Gain(factor) => format!("{factor:.4} times the true one"),
+            });
+        match (effect.unlikely(values), error) {
+            (Some(why), error) => {
+                // Of an effect that goes by the sign of the current no single error does the same.
+                let error = error.unwrap_or_else(|| "off by a zero or a gain".to_owned());
+                Some((
+                    format!("{why}: likelier than {id} is a recorded current that is {error}"),
+                    true,
+                ))
+            }
+            (None, Some(error)) => Some((
                 format!(
                     "the recorded current is taken to be right: one that is {error} would hardly look different from {id}"
                 ),
                 false,
-            ),
-        })
+            )),
+            (None, None) => None,
+        }
     });
     let is_zero = |Member { effect, values }: &Member| {
         matches!(
