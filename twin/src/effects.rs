@@ -296,6 +296,12 @@ fn within_a_period(time_s: f64, held_s: f64) -> Option<&'static str> {
     (time_s <= WHOLE_ROWS * held_s).then_some(sampled_window::SampledWindow.card().id)
 }
 
+/// What edges leave open ([`Effect::left_open_by_edges`]) of the width of a filter's response, where a straight line is `line_s` wide in
+/// the same measure: an edge is not, so that the filter is wider by that, in squares. (The mean is free, as an alignment.)
+fn blunted(width_s: f64, line_s: f64) -> [f64; 2] {
+    [0.0, width_s.hypot(line_s) - width_s]
+}
+
 /// A share of a change that is no longer looked for.
 const TRACE: f64 = 1e-3;
 
@@ -467,6 +473,12 @@ pub trait Effect: Sync {
 
     /// How far from its row, before and after, in s, a reading depends on the reference by more than a thousandth.
     fn reach_s(&self, _values: &[f64], _scale: &Scale) -> [f64; 2] {
+        [0.0; 2]
+    }
+
+    /// By how much a value may be lower, and higher, than what is found where only edges of the reference tell it, each somewhere between
+    /// two rows that are `step_s` apart: the simulation has a straight line there.
+    fn left_open_by_edges(&self, _parameter: usize, _value: f64, _step_s: f64) -> [f64; 2] {
         [0.0; 2]
     }
 

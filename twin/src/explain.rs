@@ -54,8 +54,8 @@ use select::{Named, Selection};
 pub use strays::{RARE, STRAY};
 use strays::{name_by_place, slips};
 use told::{
-    attribute, base_found, behind_ends, current_off, effects, fitted, plots, sentence, short,
-    times_found,
+    attribute, base_found, behind_ends, current_off, effects, fitted, not_told, plots, sentence,
+    short, times_found,
 };
 use trust::{vague, vague_beside, wavering};
 use unfitted::{Unfitted, confirmed, not_there, veto};
@@ -274,7 +274,8 @@ fn tell(
     };
     attribute(&read, shown, &mut locations);
     report.locations.extend(locations);
-    report.effects.extend(effects(bench, &selection, beside));
+    let reported = intervals::reported(bench, &selection.fit, beside);
+    report.effects.extend(effects(bench, &selection, &reported));
     report
         .holdouts
         .extend(others.iter().map(|other| other.report(model)));
@@ -298,6 +299,9 @@ fn tell(
     report
         .remarks
         .extend(times_found(&read, &selection.fit, between));
+    report
+        .remarks
+        .extend(not_told(bench, &selection, &reported));
     report.remarks.extend(behind_ends(&read));
     report
         .remarks

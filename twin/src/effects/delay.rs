@@ -50,6 +50,11 @@ impl Effect for Delay {
         reach_of_shift(values[0])
     }
 
+    fn left_open_by_edges(&self, _parameter: usize, _value: f64, step_s: f64) -> [f64; 2] {
+        // The edge of the reading is somewhere within a row as well.
+        [step_s; 2]
+    }
+
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {
         scene.delay_s += values[0];
     }

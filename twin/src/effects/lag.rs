@@ -1,7 +1,9 @@
 //! First-order low-pass.
 
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, TRACE, spaced, within_a_period};
+use super::{
+    Card, Clues, Effect, Parameter, Search, Stage, TRACE, blunted, spaced, within_a_period,
+};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -40,6 +42,11 @@ impl Effect for Lag {
 
     fn reach_s(&self, values: &[f64], _scale: &Scale) -> [f64; 2] {
         [-values[0] * TRACE.ln(), 0.0]
+    }
+
+    fn left_open_by_edges(&self, _parameter: usize, value: f64, step_s: f64) -> [f64; 2] {
+        // A row is half of itself wide to each side of its middle, a lag a time constant.
+        blunted(value, 0.5 * step_s)
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

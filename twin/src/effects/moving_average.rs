@@ -2,7 +2,7 @@
 
 use super::between::Converter;
 use super::scene::{Scale, Scene};
-use super::{Card, Clues, Effect, Parameter, Search, Stage, spaced, within_a_period};
+use super::{Card, Clues, Effect, Parameter, Search, Stage, blunted, spaced, within_a_period};
 
 /// See [`CARD`].
 #[derive(Debug)]
@@ -42,6 +42,10 @@ impl Effect for MovingAverage {
 
     fn reach_s(&self, values: &[f64], _scale: &Scale) -> [f64; 2] {
         [values[0], 0.0]
+    }
+
+    fn left_open_by_edges(&self, _parameter: usize, value: f64, step_s: f64) -> [f64; 2] {
+        blunted(value, step_s)
     }
 
     fn apply(&self, values: &[f64], scene: &mut Scene<'_>) {

@@ -28,6 +28,7 @@ use super::robust::{huber, loss, weights};
 use super::slope::{Slope, change, rounds};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::{Parameter, Search};
+use crate::problem::Base;
 
 /// 97.5th percentile of the normal distribution.
 const NORMAL: f64 = 1.96;
@@ -45,6 +46,9 @@ const CHANCE: f64 = 2.5;
 const NOISE_ALONE: f64 = 1.1;
 /// Lags at which noise is asked how much it remembers.
 const LAGS: usize = 16;
+/// A change of the reference from one row to the next is an edge if those beside it are below this share of it: a course that rows follow
+/// has neighbours of its own size, and a ramp that ends in the next row is as good as an edge only up to here.
+const EDGE: f64 = 0.1;
 /// Steps to each side when the end of a profile is looked for.
 const OUTWARD: usize = 40;
 /// Turns by which an alias is asked for at once.
@@ -397,6 +401,111 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit, beside: f64) -> Vec<Vec<[f64;
         .collect()
 }
 
+/// The intervals as they are reported.
+#[derive(Debug, Default)]
+pub struct Reported {
+    /// As [`intervals`] gives them, and wider where that is all that can be known.
+    pub ci95: Vec<Vec<[f64; 2]>>,
+    /// Values that move nothing where they stand: member and parameter.
+    pub unmoved: Vec<(usize, usize)>,
+    /// Members with a time that is told by edges whose place between two rows is not known.
+    pub by_edges: Vec<usize>,
+}
+
+/// The intervals as they are reported. Names do not turn on what is added here: an effect is named for the values that it is told by,
+/// and an edge that comes late is late, by however much.
+pub fn reported(bench: &Workbench<'_>, fit: &Fit, beside: f64) -> Reported {
+    let mut reported = Reported {
+        ci95: intervals(bench, fit, beside),
+        ..Reported::default()
+    };
+    let slope = fit.slope(bench);
+    let course = told_by_course(bench);
+    for (m, member) in fit.model.members.iter().enumerate() {
+        if bench.shown(member).is_some() {
+            continue;
+        }
+        for (p, parameter) in member.effect.card().parameters.iter().enumerate() {
+            let value = member.values[p];
+            if parameter.internal || !value.is_finite() {
+                continue;
+            }
+            let ends = &mut reported.ci95[m][p];
+            if parameter.search != Search::Stepped && slope.index(m, p).is_none() {
+                let other_physics = 0.5 * beside / (fit.sigma * fit.sigma);
+                let rise = RISE + other_physics;
+                *ends = [-1.0, 1.0]
+                    .map(|sign| profile(bench, fit, (m, p), parameter, sign, rise, None));
+                reported.unmoved.push((m, p));
+                continue;
+            }
+            let open_s = member
+                .effect
+                .left_open_by_edges(p, value, bench.scale.step_s);
+            if open_s == [0.0; 2] {
+                continue;
+            }
+            let wider = [0, 1].map(|side| {
+                let (end, sign) = (ends[side], [-1.0, 1.0][side]);
+                let half = sign * (end - value);
+                let told = (half / course.sqrt()).min(half.hypot(open_s[side]));
+                let wider = value + sign * told.max(half);
+                // That there is any of it is told, if it was.
+                match (end > parameter.off, end < parameter.off) {
+                    (true, _) if value > parameter.off => wider.max(parameter.off),
+                    (_, true) if value < parameter.off => wider.min(parameter.off),
+                    _ => wider,
+                }
+            });
+            // A remark is for where most of what is left open is the edges'.
+            if wider[1] - wider[0] > 2.0 * (ends[1] - ends[0]) {
+                reported.by_edges.push(m);
+            }
+            *ends = wider;
+        }
+    }
+    reported
+}
+
+/// The share of what tells a time that is not in edges: changes of the reference within one row, in squares of its slope. Straight lines
+/// put an edge into the middle between two rows; where it was, no row says. A model file that states a held reference does.
+fn told_by_course(bench: &Workbench<'_>) -> f64 {
+    let problem = bench.problem;
+    if matches!(&problem.base, Base::Sensor(base) if base.held_reference || base.quasi_static) {
+        return 1.0;
+    }
+    let drive = &problem.drive;
+    // What noise makes of a row is no course that tells a time.
+    let noise = problem
+        .noise
+        .hypot(std::f64::consts::SQRT_2 * bench.reference_noise);
+    let (mut by_course, mut by_edges) = (0.0, 0.0);
+    for rows in &drive.segments {
+        let at: Vec<usize> = rows.clone().step_by(drive.stride()).collect();
+        let rise = |pair: &[usize]| bench.steady[pair[1]] - bench.steady[pair[0]];
+        let rises: Vec<f64> = at.windows(2).map(rise).collect();
+        for (k, rise) in rises.iter().enumerate() {
+            let h_s = drive.t_s[at[k + 1]] - drive.t_s[at[k]];
+            if rise.abs() <= noise || h_s <= 0.0 {
+                continue;
+            }
+            let beside = |k: Option<usize>| k.and_then(|k| rises.get(k)).map_or(0.0, |by| by.abs());
+            let most = beside(k.checked_sub(1)).max(beside(Some(k + 1)));
+            let energy = (rise / h_s).powi(2);
+            if most < EDGE * rise.abs() {
+                by_edges += energy;
+            } else {
+                by_course += energy;
+            }
+        }
+    }
+    if by_edges > 0.0 {
+        by_course / (by_course + by_edges)
+    } else {
+        1.0
+    }
+}
+
 /// Whether the loss of a residual has risen by more than what bounds a 95 % interval.
 fn excluded(fit: &Fit, rise: f64) -> impl Fn(&[f64]) -> bool {
     // What is left may be louder or quieter than the spread that the loss is told in.
@@ -523,7 +632,7 @@ fn profile(
 mod tests {
     use super::*;
     use crate::effects::find;
-    use crate::problem::{Base, Coloured, Drive, Observed, Problem, SensorBase, View};
+    use crate::problem::{Coloured, Drive, Observed, Problem, SensorBase, View};
     use rand_chacha::ChaCha8Rng;
     use rand_chacha::rand_core::SeedableRng as _;
     use rand_distr::{Distribution as _, StandardNormal};
@@ -733,6 +842,99 @@ mod tests {
         }
         assert!(covered.iter().all(|covered| *covered >= 17), "{covered:?}");
         assert!(more >= 10, "{more}");
+    }
+
+    /// Pulses to one side and to the other, that begin and end at once, on a row each.
+    fn pulses(t_s: f64, row_s: f64) -> f64 {
+        let row = (t_s / row_s + 1e-6).floor();
+        let turn = (row / 60.0).floor();
+        let k = 2.0 * turn + f64::from(u8::from(row - 60.0 * turn >= 20.0));
+        400.0 * (std::f64::consts::PI * k).cos() + 80.0 * (78.233 * k).sin()
+    }
+
+    /// Pulses on rows of a second, read at those rows by what `read` makes of the current at any time.
+    fn of_pulses(read: impl Fn(&dyn Fn(f64) -> f64, f64) -> f64, seed: u64) -> Problem {
+        let mut problem = problem(seed, WHITE, true, 0.0);
+        let t_s: Vec<f64> = (0..ROWS).map(|k| k as f64).collect();
+        let current_a = |t_s: f64| pulses(t_s.max(0.0), 1.0);
+        let mut random = ChaCha8Rng::seed_from_u64(100 + seed);
+        let reading = t_s.iter().map(|t| {
+            let noise: f64 = StandardNormal.sample(&mut random);
+            read(&current_a, *t) + NOISE_A * noise
+        });
+        problem.observed = Observed::with_drive(t_s.clone(), reading.collect());
+        problem.drive.reference = t_s.iter().map(|t| current_a(*t)).collect();
+        problem.drive.t_s = t_s.into();
+        problem
+    }
+
+    fn reported_of(problem: &Problem, id: &str, values: &[f64]) -> (Reported, Vec<Vec<[f64; 2]>>) {
+        let bench = Workbench::new(problem, &[]);
+        let member = Member {
+            effect: crate::effects::find_with(id, values.len()).unwrap(),
+            values: values.to_vec(),
+        };
+        let fit = refit(&bench, &Model::default().with(member), None);
+        (reported(&bench, &fit, 0.0), intervals(&bench, &fit, 0.0))
+    }
+
+    #[test]
+    fn times_that_edges_tell_are_told_to_a_row() {
+        for truth_s in [0.3, 0.6, 1.5] {
+            let problem = of_pulses(|current_a, t_s| current_a(t_s - truth_s), 1);
+            let (told, narrow) = reported_of(&problem, "delay", &[1.0]);
+            let [low, high] = told.ci95[0][0];
+            let [from, to] = narrow[0][0];
+            assert!(to - from < 0.01, "{narrow:?}");
+            assert!(low <= truth_s && truth_s <= high, "{truth_s}: {told:?}");
+            // Late it is.
+            assert!(low >= 0.0 && high - low < 2.1, "{told:?}");
+            assert_eq!(told.by_edges, [0]);
+        }
+        // A model file that says that the reference is held says where its edges are.
+        let mut held = of_pulses(|current_a, t_s| current_a(t_s - 1.0), 1);
+        held.base = Base::Sensor(SensorBase {
+            held_reference: true,
+            ..SensorBase::default()
+        });
+        let (told, narrow) = reported_of(&held, "delay", &[1.0]);
+        assert_eq!(told.ci95, narrow);
+        assert!(told.by_edges.is_empty());
+    }
+
+    #[test]
+    fn a_filter_is_longer_by_what_straight_lines_blunt() {
+        let window_s = 2.0;
+        let mean = |current_a: &dyn Fn(f64) -> f64, t_s: f64| {
+            let parts = (0..100).map(|k| (f64::from(k) + 0.5) * 0.01 * window_s);
+            parts.map(|late_s| current_a(t_s - late_s)).sum::<f64>() / 100.0
+        };
+        let (told, narrow) = reported_of(&of_pulses(mean, 2), "moving-average", &[1.8]);
+        let ([_, high], [_, to]) = (told.ci95[0][0], narrow[0][0]);
+        assert!(to < high && window_s <= high, "{told:?} {narrow:?}");
+        assert!(high < 1.5 * window_s, "{told:?}");
+    }
+
+    #[test]
+    fn a_course_that_rows_follow_tells_a_time_as_before() {
+        let problem = problem(3, WHITE, true, 0.0);
+        let (told, narrow) = reported_of(&problem, "delay", &[TRUTH[2].1]);
+        assert_eq!(told.ci95, narrow);
+        assert!(told.by_edges.is_empty() && told.unmoved.is_empty());
+    }
+
+    #[test]
+    fn a_value_that_moves_nothing_is_told_as_far_as_it_moves_nothing() {
+        // Each pulse turns the whole core over, whatever its coercive current is.
+        let kept_a = |current_a: f64| 3.0 * current_a.signum();
+        let problem = of_pulses(|current_a, t_s| current_a(t_s) - kept_a(current_a(t_s)), 4);
+        let (told, narrow) = reported_of(&problem, "core-hysteresis", &[3.0, 12.0]);
+        let [remanence, coercivity] = [told.ci95[0][0], told.ci95[0][1]];
+        assert_eq!(told.unmoved, [(0, 1)], "{told:?}");
+        assert_eq!(narrow[0][1], [12.0; 2]);
+        // From a hundredth of the range to swings that turn all of it over: 1.5 times it to each side.
+        assert!(coercivity[0] <= 6.0 && coercivity[1] > 60.0, "{told:?}");
+        assert!(remanence[1] - remanence[0] < 0.5, "{told:?}");
     }
 
     #[test]

@@ -2,10 +2,11 @@
 
 use super::fit::Fit;
 use super::flexible::Explainable;
+use super::intervals::Reported;
 use super::select::{Selection, percent};
 use super::slope::{BASE_OFF, at_base_end};
 use super::workbench::{Member, Workbench};
-use super::{Nuisance, intervals, locate};
+use super::{Nuisance, locate};
 use crate::effects::ocv::bend_v;
 use crate::effects::{CurrentError, find};
 use crate::problem::{Base, Problem};
@@ -86,13 +87,12 @@ fn unit(problem: &Problem, unit: &str) -> String {
     }
 }
 
-/// The named effects with their values, intervals and evidence; `beside` as in [`intervals::intervals`].
+/// The named effects with their values, intervals and evidence.
 pub(super) fn effects(
     bench: &Workbench<'_>,
     selection: &Selection,
-    beside: f64,
+    reported: &Reported,
 ) -> Vec<EffectReport> {
-    let intervals = intervals::intervals(bench, &selection.fit, beside);
     selection
         .named
         .iter()
@@ -106,7 +106,7 @@ pub(super) fn effects(
                 .filter(|(p, parameter)| !parameter.internal && member.values[*p].is_finite())
                 .map(|(p, parameter)| {
                     let value = member.values[p];
-                    let [from, to] = intervals[named.index][p];
+                    let [from, to] = reported.ci95[named.index][p];
                     // What has no sign has none in its interval; other bounds are those of the search.
                     let unsigned = member.effect.bounds(p, &bench.scale).0 == 0.0 && value >= 0.0;
                     ParameterReport {
@@ -143,6 +143,39 @@ pub(super) fn effects(
             }
         })
         .collect()
+}
+
+/// What is to be said of intervals: values that the recording does not tell at all, and times that it tells to a row.
+pub(super) fn not_told(
+    bench: &Workbench<'_>,
+    selection: &Selection,
+    reported: &Reported,
+) -> Vec<String> {
+    let name = &bench.problem.name;
+    let members = &selection.fit.model.members;
+    let unmoved = reported.unmoved.iter().map(|&(m, p)| {
+        let (member, [low, high]) = (&members[m], reported.ci95[m][p]);
+        let parameter = &member.effect.card().parameters[p];
+        format!(
+            "{name}: {} of {} is not told: with anything from {} to {} {} the simulation is the same to within noise, and {} is only where the search stood",
+            parameter.name,
+            member.id(),
+            short(low),
+            short(high),
+            unit(bench.problem, parameter.unit),
+            short(member.values[p])
+        )
+    });
+    let late: Vec<&str> = reported.by_edges.iter().map(|m| members[*m].id()).collect();
+    let by_edges = (!late.is_empty()).then(|| {
+        format!(
+            "{name}: what tells the time of {} are steps of the reference within one row, and where between two rows, {} s apart, each of \
+             them was is not known: the interval has what that leaves open",
+            late.join(" and "),
+            short(bench.scale.step_s)
+        )
+    });
+    unmoved.chain(by_edges).collect()
 }
 
 /// What an effect does, in words of the signal's unit: the library is written for currents.
