@@ -113,6 +113,7 @@ fn problem(rows: usize, view: View, effects: &[(&str, &[f64])]) -> Problem {
                 efficiency: 1.0,
                 initial_soc: vec![0.8],
                 gap_excess_ah: Vec::new(),
+                gap_soc_sigma: Vec::new(),
                 initial_soc_sigma: vec![0.01],
                 ocv: (0..=100)
                     .map(|k| f64::from(k) / 100.0)

@@ -241,9 +241,11 @@ pub struct BatteryBase {
     pub efficiency: f64,
     /// State of charge at the start of each segment, 0 … 1.
     pub initial_soc: Vec<f64>,
-    /// What a counter says to have flowed over the gap before each segment beyond a straight line through the current at the gap's
-    /// ends, in Ah; 0, or no value, without one.
+    /// What flowed over the gap before each segment beyond a straight line through the current at the gap's ends, in Ah, as a counter or
+    /// the first reading after it tells; 0, or no value, where neither does.
     pub gap_excess_ah: Vec<f64>,
+    /// Standard uncertainty of what the gap before each segment leaves of the state of charge, 0 … 1; 0, or no value: nothing is open.
+    pub gap_soc_sigma: Vec<f64>,
     /// Standard uncertainty of [`BatteryBase::initial_soc`] at the start of each operation, 0 … 1; 0, or no value: exact.
     pub initial_soc_sigma: Vec<f64>,
     /// Open-circuit voltage of the whole series string: state of charge (ascending) and V.

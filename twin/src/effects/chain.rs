@@ -10,6 +10,8 @@ use crate::problem::{Base, Problem, View};
 pub struct Nuisance {
     /// Added to the state of charge at the start of each operation, 0 … 1; nothing where there is no value.
     pub soc_shift: Vec<f64>,
+    /// Added to it over the gap before each segment, 0 … 1: what flowed there and was not recorded; nothing where there is no value.
+    pub gap_soc_shift: Vec<f64>,
     /// Relative change of the ohmic resistance.
     pub resistance: f64,
     /// Added to what the recorded current is above the battery's, in A.
@@ -340,6 +342,7 @@ impl<'a> Chain<'a> {
             Link::Count => {
                 if let Some(battery) = &mut scene.battery {
                     battery.soc_shift.clone_from(&nuisance.soc_shift);
+                    battery.gap_soc_shift.clone_from(&nuisance.gap_soc_shift);
                     battery.count(scene.drive, &scene.signal);
                     if self.problem.view != View::StateOfCharge {
                         battery.open_circuit();

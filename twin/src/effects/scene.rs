@@ -104,6 +104,11 @@ pub struct Battery<'a> {
     pub efficiency: f64,
     /// Added to the state of charge at the start of each operation, 0 … 1; nothing where there is no value.
     pub soc_shift: Vec<f64>,
+    /// Added to it over the gap before each segment.
+    pub gap_soc_shift: Vec<f64>,
+    /// Where a gap ends over which the charge is not known, and the mean current that its charge makes there, in A: of the rows at its ends
+    /// neither says what flowed in it. Filled where the charge is counted.
+    pub gap_mean_a: Vec<(usize, f64)>,
     /// Factor of the ohmic resistance by design, at 25 °C.
     pub resistance: f64,
     /// State of charge, 0 … 1; filled between the stages of charge and temperature.
@@ -374,11 +379,12 @@ impl Steps {
     }
 
     /// A sum of first-order low-passes of a current, each with a weight, all at rest when a segment begins: one pass over the rows.
-    /// Between the rows it goes as [`Drive::mean_share`] says.
+    /// Between the rows it goes as [`Drive::mean_share`] says, and over the step to one of `gaps` it is what is said there.
     pub fn ladder<const N: usize>(
         &self,
         segments: &[Range<usize>],
         input: &[f64],
+        gaps: &[(usize, f64)],
         taus_s: [f64; N],
         weights: [f64; N],
     ) -> Vec<f64> {
@@ -393,22 +399,37 @@ impl Steps {
         }
         for rows in segments.iter().filter(|rows| !rows.is_empty()) {
             let mut last = [0.0; N];
-            let after = rows.start + 1..rows.end;
-            let shares = self.mean_share.as_ref();
-            let shares = shares.map_or(&[][..], |shares| &shares[after.clone()]);
-            let mut shares = shares.iter();
-            let pairs = input[rows.clone()].windows(2);
-            for ((pair, out), kind) in pairs.zip(&mut output[after.clone()]).zip(&self.kind[after])
-            {
-                let pair = [pair[0], pair[1]];
-                let pair = shares.next().map_or(pair, |share| ends(*share, pair));
-                let [kept, from, to] = &of_kind[*kind as usize];
+            let mut step = |kind: u32, pair: [f64; 2]| {
+                let [kept, from, to] = &of_kind[kind as usize];
                 let mut sum = 0.0;
                 for k in 0..N {
                     last[k] = kept[k] * last[k] + (from[k] * pair[0] + to[k] * pair[1]);
                     sum += last[k];
                 }
-                *out = sum;
+                sum
+            };
+            let inside = gaps.iter().filter(|(row, _)| rows.contains(row));
+            let mut start = rows.start;
+            for (end, gap) in inside
+                .map(|(row, mean)| (*row, Some(*mean)))
+                .chain([(rows.end, None)])
+            {
+                let after = start + 1..end;
+                let shares = self.mean_share.as_ref();
+                let shares = shares.map_or(&[][..], |shares| &shares[after.clone()]);
+                let mut shares = shares.iter();
+                let pairs = input[start..end].windows(2);
+                for ((pair, out), kind) in
+                    pairs.zip(&mut output[after.clone()]).zip(&self.kind[after])
+                {
+                    let pair = [pair[0], pair[1]];
+                    let pair = shares.next().map_or(pair, |share| ends(*share, pair));
+                    *out = step(*kind, pair);
+                }
+                if let Some(mean) = gap {
+                    output[end] = step(self.kind[end], [mean; 2]);
+                }
+                start = end;
             }
         }
         output
@@ -793,6 +814,8 @@ impl<'a> Battery<'a> {
                 1.0
             },
             soc_shift: Vec::new(),
+            gap_soc_shift: Vec::new(),
+            gap_mean_a: Vec::new(),
             resistance: 1.0,
             soc: Series::default(),
             open_circuit_v: Series::default(),
@@ -810,6 +833,7 @@ impl<'a> Battery<'a> {
         let of_segment = |values: &[f64], index: usize| values.get(index).copied();
         let operations = drive.operation_numbers();
         let mut end = 1.0;
+        self.gap_mean_a.clear();
         for (index, rows) in drive
             .segments
             .iter()
@@ -820,7 +844,14 @@ impl<'a> Battery<'a> {
                 let excess_ah = of_segment(&self.base.gap_excess_ah, index).unwrap_or_default();
                 let gap_s = drive.t_s[rows.start] - drive.t_s[rows.start - 1];
                 let ends = [current_a[rows.start - 1], current_a[rows.start]];
-                end - gap_ah(ends, gap_s, excess_ah, self.efficiency) / self.capacity_ah
+                let first = end
+                    - gap_ah(ends, gap_s, excess_ah, self.efficiency) / self.capacity_ah
+                    + of_segment(&self.gap_soc_shift, index).unwrap_or_default();
+                if of_segment(&self.base.gap_soc_sigma, index).is_some_and(|sigma| sigma > 0.0) {
+                    let mean_a = (end - first) / (per_as * gap_s);
+                    self.gap_mean_a.push((rows.start, mean_a));
+                }
+                first
             } else {
                 of_segment(&self.base.initial_soc, index).unwrap_or(1.0)
                     + of_segment(&self.soc_shift, operations[index]).unwrap_or_default()
@@ -836,6 +867,16 @@ impl<'a> Battery<'a> {
             end = last;
         }
         self.soc = soc.into();
+    }
+
+    /// The mean current over gaps over which the charge is not known, in A, times the factor on every resistance: where each ends.
+    pub fn driven_over_gaps(&self) -> Vec<(usize, f64)> {
+        let gaps = self.gap_mean_a.iter();
+        gaps.map(|(row, mean_a)| {
+            let factor = 0.5 * (self.factor[row - 1] + self.factor[*row]);
+            (*row, mean_a * factor)
+        })
+        .collect()
     }
 
     /// Looks up the open-circuit voltage: after the charge is counted.

@@ -33,15 +33,31 @@ pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<Vec<f64>> {
         right += part;
     }
     // Starts that only these rows tell.
-    let untold = |here: &DMatrix<f64>| {
-        let all = |k: usize| total[(k, k)] - slope.prior[k];
-        slope.starts(|_, k| bench.starts.len() > 1 && starts::within_block(here[(k, k)], all(k)))
+    let untold = |rows: &Range<usize>, here: &DMatrix<f64>| {
+        let told = |k: usize, rows: Range<usize>| -> f64 {
+            let of_row = |row: usize| weights[row] * slope.columns[k][row].powi(2);
+            rows.map(of_row).sum()
+        };
+        slope.starts(|start, k| {
+            let start = &bench.starts[start];
+            if !start.is_shared() {
+                let all = total[(k, k)] - slope.prior[k];
+                return bench.starts.len() > 1 && starts::within_block(here[(k, k)], all);
+            }
+            // What follows another gap tells of both.
+            let own = start.own_rows().iter();
+            let (inside, all) = own.fold((0.0, 0.0), |(inside, all), own| {
+                let within = own.start.max(rows.start)..own.end.min(rows.end);
+                (inside + told(k, within), all + told(k, own.clone()))
+            });
+            starts::within_block(inside, all)
+        })
     };
     // Loss of rows with the values that are left without them.
     let without = |rows: Range<usize>, here: &DMatrix<f64>, part: &DVector<f64>| -> Vec<f64> {
         let (mut matrix, others) = (&total - here, &right - part);
         let mut left = slope.at_ends(&fit.model, &right);
-        left.extend(untold(here));
+        left.extend(untold(&rows, here));
         forget(&left, &mut matrix);
         let step = solve(&matrix, &others, 1e-9);
         rows.map(|row| {
@@ -58,7 +74,7 @@ pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<Vec<f64>> {
         .zip(&blocks)
         .map(|(rows, (matrix, part))| {
             let mut told = matrix.clone();
-            forget(&untold(matrix), &mut told);
+            forget(&untold(rows, matrix), &mut told);
             if !solver.tells(&told, ALONE) {
                 return without(rows.clone(), matrix, part);
             }

@@ -377,12 +377,17 @@ pub(super) fn unrounded(bench: &Workbench<'_>, model: &Model) -> Option<(Model, 
     })
 }
 
-/// Coordinates that are moved in one run: each by itself but for the starts, of which no operation knows another's.
+/// Coordinates that are moved in one run: each by itself but for the starts, of which no operation knows another's. What flowed over a gap
+/// is known to all that follows.
 fn runs<'k>(
+    bench: &Workbench<'_>,
     coordinates: &[(Coordinate, f64, f64, f64)],
     some: &'k [usize],
 ) -> impl Iterator<Item = &'k [usize]> {
-    let is_start = |k: &usize| matches!(coordinates[*k].0, Coordinate::SocShift(_));
+    let is_start = |k: &usize| match coordinates[*k].0 {
+        Coordinate::SocShift(start) => !bench.starts[start].is_after_gap(),
+        _ => false,
+    };
     some.chunk_by(move |a, b| is_start(a) && is_start(b))
 }
 
@@ -429,7 +434,7 @@ pub(super) fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> 
         if missing.is_empty() {
             break;
         }
-        let moved: Vec<(Change, Model)> = runs(&coordinates, &missing)
+        let moved: Vec<(Change, Model)> = runs(bench, &coordinates, &missing)
             .map(|together| {
                 let mut moved = model.clone();
                 for k in together {
@@ -444,7 +449,7 @@ pub(super) fn slope(bench: &Workbench<'_>, model: &Model, predicted: &[f64]) -> 
             })
             .collect();
         let varied = bench.vary(model, &moved);
-        let parts = runs(&coordinates, &missing)
+        let parts = runs(bench, &coordinates, &missing)
             .zip(varied)
             .flat_map(|(together, varied)| apart(bench, &coordinates, together, varied, predicted));
         for (k, mut column) in parts {

@@ -209,7 +209,9 @@ fn key(model: &Model) -> Key {
         bits(
             &[
                 nuisance.soc_shift.as_slice(),
-                // Where the starts end, of which there may be any number.
+                // Where the starts end, of which there may be any number; and the gaps.
+                &[f64::NAN],
+                nuisance.gap_soc_shift.as_slice(),
                 &[f64::NAN],
                 nuisance.ocv_bend_v.as_slice(),
                 &[

@@ -104,6 +104,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             efficiency: battery.efficiency,
             initial_soc: Vec::new(),
             gap_excess_ah: Vec::new(),
+            gap_soc_sigma: Vec::new(),
             initial_soc_sigma: Vec::new(),
             ocv,
             cells,
@@ -146,6 +147,9 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             },
             battery,
         );
+        if view == View::Voltage && work.purpose.compares() {
+            start::leave_out(work, &mut observed, (&drive, &base), name);
+        }
         items.push(Item {
             problem: Problem {
                 view,

@@ -21,6 +21,15 @@ const OF_READING: f64 = 0.005;
 const WORTH: f64 = 0.3;
 /// A tester's counter is believed over a gap if it has followed the current within this share of the capacity before.
 const COUNTER_SHARE: f64 = 0.02;
+/// A gap that leaves less than this of the state of charge open, 0 … 1, leaves nothing open: where a voltage is as steep as 1 V from full to
+/// empty it is a tenth of a millivolt.
+const OPEN: f64 = 1e-4;
+
+/// Times as long as a gap over which the charge is not known for which voltages after it are left out: of what the cell does not remember
+/// rightly where the gap ends, whatever it forgets in which time, a tenth is left then at most (3³/4⁴).
+const FORGOTTEN: f64 = 3.0;
+/// No more than this share of the readings is left out after gaps: with more, too little of the recording would be judged.
+const MOST_OUT: f64 = 0.1;
 
 /// What was recorded of a battery.
 pub(super) struct Readings<'a> {
@@ -50,8 +59,10 @@ pub(super) fn find(
     let drive = readings.drive;
     let mut end = 1.0;
     let mut bridged = 0;
+    let mut open: Vec<f64> = Vec::new();
     for (index, own) in drive.segments.iter().enumerate() {
         let mut excess_ah = 0.0;
+        let mut gap_sigma = 0.0;
         let first = if drive.is_continued(index) {
             let gap_s = drive.t_s[own.start] - drive.t_s[own.start - 1];
             let ends_a = [drive.reference[own.start - 1], drive.reference[own.start]];
@@ -59,11 +70,32 @@ pub(super) fn find(
             let counted = readings
                 .counter_ah
                 .and_then(|ah| over_gap(ah, drive, before.clone(), own.start, battery.capacity_ah));
+            let left_ah = |excess_ah| gap_ah(ends_a, gap_s, excess_ah, battery.efficiency);
+            let line = end - left_ah(0.0) / battery.capacity_ah;
             match counted {
                 Some(ah) => excess_ah = ah - gap_ah(ends_a, gap_s, 0.0, 1.0),
-                None => bridged += 1,
+                None => {
+                    let sigma = gap_s * line_sigma_a(drive, index) / 3600.0 / battery.capacity_ah;
+                    let sigma = sigma.max(contradicted(base, readings, index, line - end));
+                    if sigma <= OPEN {
+                        bridged += 1;
+                    } else {
+                        gap_sigma = sigma.min(1.0 / BASE_OFF);
+                        open.push(gap_sigma);
+                        if let Some(seen) = seen(base, readings, index) {
+                            let flowed_ah =
+                                (end - weighted((line, sigma), seen)) * battery.capacity_ah;
+                            let charged = if flowed_ah < 0.0 {
+                                battery.efficiency
+                            } else {
+                                1.0
+                            };
+                            excess_ah = flowed_ah / charged - gap_ah(ends_a, gap_s, 0.0, 1.0);
+                        }
+                    }
+                }
             }
-            end - gap_ah(ends_a, gap_s, excess_ah, battery.efficiency) / battery.capacity_ah
+            end - left_ah(excess_ah) / battery.capacity_ah
         } else {
             let (first, sigma) = begun(work, base, readings, battery, index);
             base.initial_soc_sigma.push(sigma);
@@ -71,12 +103,59 @@ pub(super) fn find(
         };
         base.initial_soc.push(first);
         base.gap_excess_ah.push(excess_ah);
+        base.gap_soc_sigma.push(gap_sigma);
         end = first - charge_ah(drive, own.clone(), battery.efficiency) / battery.capacity_ah;
     }
     if bridged > 0 {
         work.remark(format!(
             "{bridged} gaps in the current: the charge over them is taken from a straight line between its ends"
         ));
+    }
+    if !open.is_empty() {
+        work.remark(format!(
+            "{} gaps in the current over which its charge is not known: a straight line between its ends leaves up to {:.1} points of per \
+             cent of the state of charge open, which {} tells",
+            open.len(),
+            100.0 * open.iter().fold(0.0, |most: f64, sigma| most.max(*sigma)),
+            readings.name
+        ));
+    }
+}
+
+/// Leaves voltages out that follow a gap over which the charge is not known: what a cell remembers of its last minutes nobody knows, and
+/// what it remembers for longer goes by the charge. Too many of them are left out for a part of that time each.
+pub(super) fn leave_out(
+    work: &mut Work<'_>,
+    observed: &mut Observed,
+    (drive, base): (&Drive, &BatteryBase),
+    name: &str,
+) {
+    let since = |row: usize| {
+        let segment = observed.segment_of(row);
+        let is_open = base
+            .gap_soc_sigma
+            .get(segment)
+            .is_some_and(|sigma| *sigma > 0.0);
+        let start = drive.segments[segment].start;
+        is_open.then(|| {
+            let gap_s = drive.t_s[start] - drive.t_s[start - 1];
+            (observed.t_s[row] - drive.t_s[start]) / gap_s
+        })
+    };
+    let mut after: Vec<(f64, usize)> = (0..observed.t_s.len())
+        .filter(|row| observed.valid[*row])
+        .filter_map(|row| Some((since(row).filter(|gaps| *gaps < FORGOTTEN)?, row)))
+        .collect();
+    after.sort_by(|a, b| a.0.total_cmp(&b.0));
+    after.truncate((MOST_OUT * observed.valid_rows() as f64) as usize);
+    if !after.is_empty() {
+        work.remark(format!(
+            "{} readings of {name} after such gaps are left out: what the battery remembers of the current there is not known",
+            after.len()
+        ));
+    }
+    for (_, row) in after {
+        observed.valid[row] = false;
     }
 }
 
@@ -172,18 +251,95 @@ fn over_gap(
     (follows && over.is_finite() && over.abs() <= capacity_ah).then_some(over)
 }
 
+/// How far the mean current over the gap before a segment may be from that of a straight line between its ends, in A, as a standard
+/// uncertainty: as far as the current itself is from it over as long before the gap and after it. A current that stays as it is there
+/// is taken to do so in the gap.
+fn line_sigma_a(drive: &Drive, segment: usize) -> f64 {
+    let after = drive.segments[segment].start;
+    let (from_s, to_s) = (drive.t_s[after - 1], drive.t_s[after]);
+    let mean_a = 0.5 * (drive.reference[after - 1] + drive.reference[after]);
+    let near_s = 2.0 * from_s - to_s..=2.0 * to_s - from_s;
+    let (mut squares, mut time_s) = (0.0, 0.0);
+    let numbers = drive.operation_numbers();
+    let of_same = |index: &usize| numbers[*index] == numbers[segment];
+    for index in (0..drive.segments.len()).filter(of_same) {
+        let rows = drive.segments[index].clone();
+        for row in rows.start + 1..rows.end {
+            if near_s.contains(&drive.t_s[row - 1]) && near_s.contains(&drive.t_s[row]) {
+                let ends = drive.ends(row, [drive.reference[row - 1], drive.reference[row]]);
+                let [from, to] = ends.map(|end_a| end_a - mean_a);
+                let step_s = drive.t_s[row] - drive.t_s[row - 1];
+                squares += (from * from + from * to + to * to) / 3.0 * step_s;
+                time_s += step_s;
+            }
+        }
+    }
+    if time_s > 0.0 {
+        return (squares / time_s).sqrt();
+    }
+    // Lone rows: what the whole drive does is all that is known.
+    let off = drive.reference.iter().map(|a| (a - mean_a).powi(2));
+    (off.sum::<f64>() / drive.len() as f64).sqrt()
+}
+
+/// By how much the readings on both sides of a gap contradict what a line says of the state of charge, 0 … 1; 0 if they do not: nothing was
+/// recorded of a trip that began and ended within a rest.
+fn contradicted(base: &BatteryBase, readings: &Readings<'_>, segment: usize, line: f64) -> f64 {
+    let before = last_seen(base, readings, segment - 1);
+    let (Some(before), Some(after)) = (before, seen(base, readings, segment)) else {
+        return 0.0;
+    };
+    let off = (after.0 - before.0 - line).abs();
+    if off > BASE_OFF * before.1.hypot(after.1) {
+        off
+    } else {
+        0.0
+    }
+}
+
 /// State of charge at the start of a segment from its first reading.
 fn seen(base: &BatteryBase, readings: &Readings<'_>, segment: usize) -> Option<Soc> {
+    let drive_row = readings.drive.segments[segment].start;
+    seen_at(
+        base,
+        readings,
+        drive_row,
+        read_rows(readings.observed, segment).next()?,
+    )
+}
+
+/// The same at its end from its last one.
+fn last_seen(base: &BatteryBase, readings: &Readings<'_>, segment: usize) -> Option<Soc> {
+    let drive_row = readings.drive.segments[segment].end - 1;
+    seen_at(
+        base,
+        readings,
+        drive_row,
+        read_rows(readings.observed, segment).last()?,
+    )
+}
+
+/// Rows of a segment that were read.
+fn read_rows(observed: &Observed, segment: usize) -> impl Iterator<Item = usize> + '_ {
+    let rows = (0..observed.t_s.len()).filter(move |row| observed.segment_of(*row) == segment);
+    rows.filter(|row| observed.valid[*row] && observed.value[*row].is_finite())
+}
+
+/// State of charge from a reading, by the current at a row of the drive.
+fn seen_at(
+    base: &BatteryBase,
+    readings: &Readings<'_>,
+    drive_row: usize,
+    row: usize,
+) -> Option<Soc> {
     let (drive, observed) = (readings.drive, readings.observed);
-    let mut rows = (0..observed.t_s.len()).filter(|row| observed.segment_of(*row) == segment);
-    let row = rows.find(|row| observed.valid[*row] && observed.value[*row].is_finite())?;
     let value = observed.value[row];
     // Noise of that one reading, and what rounding takes of it.
     let noise = readings.noise.hypot(observed.grid / 12f64.sqrt());
     if readings.view == View::StateOfCharge {
         return Some((value / 100.0, OF_READING.hypot(noise / 100.0)));
     }
-    let current_a = drive.reference[drive.segments[segment].start];
+    let current_a = drive.reference[drive_row];
     let rest_v = base.cells * AT_REST_V;
     let there = inverse(&base.ocv, value + base.resistance_ohm * current_a, rest_v)?;
     // A voltage under load says little.

@@ -31,6 +31,8 @@ pub struct Cell {
     pub slow_ohm: f64,
     /// What the recorded current is above the cell's, in A.
     pub current_zero_a: f64,
+    /// What it is discharged by beside the recorded current, in A.
+    pub load_a: f64,
 }
 
 pub const AS_DESIGNED: Cell = Cell {
@@ -38,6 +40,7 @@ pub const AS_DESIGNED: Cell = Cell {
     resistance_ohm: DESIGN_OHM,
     slow_ohm: 0.0,
     current_zero_a: 0.0,
+    load_a: 0.0,
 };
 
 /// Rows of one operation from a state of charge on, the first reading off by so much.
@@ -52,8 +55,8 @@ pub fn operation(cell: Cell, soc: f64, first_v: f64, cycle: usize, seed: u64) ->
         }
         if k % FINE == 0 {
             let error_v = if k == 0 { first_v } else { noise_v() };
-            let volts =
-                open_circuit_v(soc) - cell.resistance_ohm * current_a - cell.slow_ohm * slow_a;
+            let ohmic_v = cell.resistance_ohm * (current_a + cell.load_a);
+            let volts = open_circuit_v(soc) - ohmic_v - cell.slow_ohm * slow_a;
             text.push_str(&format!(
                 "{},{cycle},{:.5},{:.5}\n",
                 k / FINE,
@@ -67,7 +70,7 @@ pub fn operation(cell: Cell, soc: f64, first_v: f64, cycle: usize, seed: u64) ->
         current_a += step_a;
         let dt = 1.0 / FINE as f64;
         let mean_a = 0.5 * (before_a + current_a);
-        soc -= mean_a * dt / 3600.0 / cell.capacity_ah;
+        soc -= (mean_a + cell.load_a) * dt / 3600.0 / cell.capacity_ah;
         slow_a += (mean_a - slow_a) * (1.0 - (-dt / 60.0).exp());
     }
     text

@@ -1,0 +1,116 @@
+//! A gap in a battery's recording: what flowed there is not known, is told by the voltages on both sides, and is no physics.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+#[path = "common/cell.rs"]
+mod cell;
+#[path = "common/command.rs"]
+mod command;
+mod common;
+
+use cell::{AS_DESIGNED, Cell, NOISE_V, log, model, names, operation, said};
+
+/// Gaps of some seconds, each from a time in s on.
+type Gaps<'a> = &'a [(u32, u32)];
+
+const GAPS: [Gaps<'static>; 4] = [
+    &[(610, 120)],
+    &[(1530, 120)],
+    &[(1107, 400)],
+    &[(415, 90), (1320, 200), (1888, 60)],
+];
+
+/// One operation without the rows in its gaps.
+fn cut(cell: Cell, gaps: Gaps<'_>, seed: u64) -> String {
+    let is_there = |line: &&str| {
+        let t_s: u32 = line.split(',').next().unwrap().parse().unwrap();
+        !gaps
+            .iter()
+            .any(|(from_s, long_s)| (*from_s..from_s + long_s).contains(&t_s))
+    };
+    let rows = operation(cell, 0.9, 0.0005, 0, seed);
+    let left: Vec<String> = rows
+        .lines()
+        .filter(is_there)
+        .map(|line| format!("{line}\n"))
+        .collect();
+    log(&left)
+}
+
+/// Cells with an effect that the design lacks, and the value of its first parameter.
+fn concealed() -> [(&'static str, Cell, f64); 3] {
+    [
+        (
+            "capacity",
+            Cell {
+                capacity_ah: 2.7,
+                ..AS_DESIGNED
+            },
+            2.7,
+        ),
+        (
+            "polarisation",
+            Cell {
+                slow_ohm: 0.015,
+                ..AS_DESIGNED
+            },
+            0.015,
+        ),
+        (
+            "parasitic-load",
+            Cell {
+                load_a: 0.1,
+                ..AS_DESIGNED
+            },
+            0.1,
+        ),
+    ]
+}
+
+#[test]
+fn a_gap_is_no_mismatch() {
+    for gaps in GAPS {
+        for seed in 1..4 {
+            let report = said(&model(""), &cut(AS_DESIGNED, gaps, seed), None);
+            let what = format!("{gaps:?} {seed}: {}", report["summary"]);
+            assert_eq!(report["verdict"], "no-mismatch", "{what}");
+        }
+    }
+}
+
+#[test]
+fn an_effect_is_found_through_gaps() {
+    for (id, cell, truth) in concealed() {
+        let (mut covered, mut count) = (0, 0);
+        for gaps in GAPS {
+            for seed in 1..4 {
+                let report = said(&model(""), &cut(cell, gaps, seed), None);
+                let what = format!("{id} {gaps:?} {seed}: {}", report["summary"]);
+                assert_eq!(names(&report), [id], "{what}");
+                let interval = &report["effects"][0]["parameters"][0]["ci95"];
+                let [low, high] = [0, 1].map(|end| interval[end].as_f64().unwrap());
+                covered += usize::from(low <= truth && truth <= high);
+                count += 1;
+            }
+        }
+        // Of twelve intervals of 95 %, three or more miss in two of a hundred cases.
+        assert!(covered + 2 >= count, "{id}: {covered} of {count}");
+    }
+}
+
+#[test]
+fn a_file_with_gaps_that_was_never_fitted_is_judged_by_its_physics() {
+    for (id, cell, _) in concealed() {
+        // Of three gaps within minutes a cell remembers more than a tenth of the readings can be left out for.
+        for (gaps, seed) in GAPS[..3].iter().copied().zip(1..) {
+            let fitted = log(&[operation(cell, 0.9, 0.0005, 0, seed)]);
+            let other = cut(cell, gaps, seed + 50);
+            let report = said(&model(""), &fitted, Some(&other));
+            let what = format!("{id} {gaps:?}: {}", report["summary"]);
+            assert_eq!(names(&report), [id], "{what}");
+            let there = |key: &str| report["holdouts"][0][key].as_f64().unwrap();
+            assert!(there("rmse_after") < 1.2 * NOISE_V, "{what}");
+            assert!(there("rmse_before") > 2.0 * NOISE_V, "{what}");
+        }
+    }
+}
