@@ -176,10 +176,11 @@ fn a_pulse_test_is_explained_by_what_its_counter_says() {
     );
     let relaxes = |id: &&str| ["polarisation", "diffusion"].contains(id);
     assert!(names(&report).iter().all(relaxes), "{}", report["summary"]);
-    // Nine rests begin a minute before their first row: straight lines count half of it at 10 A, which looks like another capacity.
-    assert!(!names(&blind).iter().all(relaxes), "{}", blind["summary"]);
+    // Nine rests begin a minute before their first row: straight lines count half of it at 10 A. The charge of the gaps beside them is free,
+    // and takes it; certain it is not.
+    assert_ne!(blind["verdict"], "explained", "{}", blind["summary"]);
     assert!(
-        left_v < 0.3 * left_blind_v,
+        left_v < 3.0 * NOISE_V && left_v < 0.6 * left_blind_v,
         "{left_v} V with it, {left_blind_v} V without"
     );
 }
