@@ -433,7 +433,7 @@ fn decide(
             unavoidable,
         );
         // With what may be another physics, values that were told may be told no more.
-        if !(found.beside > 0.0 && vague_beside(bench, &mut selection, found.beside)) {
+        if !(found.names && vague_beside(bench, &mut selection, found.beside)) {
             break (found, left, held, confirmed);
         }
         taken_back |= selection.named.is_empty();

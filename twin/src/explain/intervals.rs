@@ -372,14 +372,15 @@ pub fn intervals(bench: &Workbench<'_>, fit: &Fit, beside: f64) -> Vec<Vec<[f64;
                         let times = at.map_or(1.0, |k| certainty.inflation[k]);
                         let half = at.map(|k| certainty.half[k]);
                         let rise = RISE * times + other_physics;
+                        // Readings that stay at a level all fall on one step of the converter.
+                        let by_step = if member.effect.level(p) {
+                            0.5 * bench.scale.quantum
+                        } else {
+                            0.0
+                        };
                         return [-1.0, 1.0].map(|sign| {
-                            let mut end = profile(bench, fit, (m, p), parameter, sign, rise, half);
-                            // Readings that stay at a level all fall on one step of the converter. (Elsewhere an end that is a
-                            // bound stays one, to the last digit.)
-                            if member.effect.level(p) {
-                                let by_step = 0.5 * bench.scale.quantum;
-                                end = value + sign * (end - value).hypot(by_step);
-                            }
+                            let end = profile(bench, fit, (m, p), parameter, sign, rise, half);
+                            let end = value + sign * (end - value).hypot(by_step);
                             let others = aliases.iter().map(|values| values[p]);
                             others.fold(end, |end, other| sign * (sign * end).max(sign * other))
                         });

@@ -86,15 +86,19 @@ pub(super) fn vague(bench: &Workbench<'_>, selection: &mut Selection) {
     withdraw(bench, selection, 0.0, &why);
 }
 
-/// The same with what may be another physics, of so much energy, as the report says the intervals: a name whose values are told no more
-/// is worth no more for it. True if there were any.
+/// The same of doubted names with values that are searched in steps (a period, a threshold), where so much energy may be another
+/// physics': with thousands of them to choose from, one follows a part of whatever is left. True if there were any.
 pub(super) fn vague_beside(bench: &Workbench<'_>, selection: &mut Selection, beside: f64) -> bool {
+    let in_steps = |member: &Member| {
+        let mut parameters = member.effect.card().parameters.iter();
+        parameters.any(|parameter| parameter.search == Search::Stepped && !parameter.internal)
+    };
+    let members = &selection.fit.model.members;
+    if !members.iter().any(in_steps) {
+        return false;
+    }
     withdraw(bench, selection, beside, &|member, intervals| {
-        [Search::Logarithmic, Search::Stepped]
-            .into_iter()
-            .find_map(|search| in_magnitudes(member, intervals, search))
-            .or_else(|| all_physics(&bench.scale, member, intervals))
-            .or_else(|| shares_of_anything(&bench.scale, member, intervals))
+        in_magnitudes(member, intervals, Search::Stepped)
     })
 }
 
@@ -252,37 +256,6 @@ fn could_be(parameter: &Parameter, low: f64, high: f64) -> String {
     )
 }
 
-/// Whether an interval takes in all that its parameter can be.
-fn takes_in_all(scale: &Scale, member: &Member, index: usize, [low, high]: [f64; 2]) -> bool {
-    let (lowest, highest) = member.effect.bounds(index, scale);
-    low <= lowest && high >= highest
-}
-
-/// A value whose interval takes in all that is physics, where that ends on both sides.
-fn all_physics(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<String> {
-    let parameters = member.effect.card().parameters.iter().zip(intervals);
-    let mut ends = parameters
-        .enumerate()
-        .filter(|(_, (parameter, _))| !parameter.internal && !parameter.open && !parameter.to_top);
-    ends.find(|(index, (_, interval))| takes_in_all(scale, member, *index, **interval))
-        .map(|(_, (parameter, [low, high]))| could_be(parameter, *low, *high))
-}
-
-/// A share that may be any, of a size that is not told from its double: every second period, or one more between two, is another one,
-/// and nothing of either is known.
-fn shares_of_anything(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<String> {
-    let parameters = member.effect.card().parameters.iter().zip(intervals);
-    let mut stepped = parameters
-        .enumerate()
-        .filter(|(_, (parameter, _))| !parameter.internal && parameter.search == Search::Stepped);
-    let any_share = stepped.clone().any(|(index, (parameter, interval))| {
-        parameter.open && takes_in_all(scale, member, index, *interval)
-    });
-    stepped
-        .find(|(_, (parameter, [low, high]))| any_share && !parameter.open && *high >= 2.0 * low)
-        .map(|(_, (parameter, [low, high]))| could_be(parameter, *low, *high))
-}
-
 /// Why the recording does not tell an effect's values: an interval over orders of magnitude or over all that is physics, or
 /// every size that the effect has could as well be none.
 fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<String> {
@@ -300,8 +273,11 @@ fn untold(scale: &Scale, member: &Member, intervals: &[[f64; 2]]) -> Option<Stri
     if magnitudes.is_some() {
         return magnitudes;
     }
-    if let Some(why) = all_physics(scale, member, intervals) {
-        return Some(why);
+    for (index, (parameter, [low, high])) in known() {
+        let (lowest, highest) = member.effect.bounds(index, scale);
+        if !parameter.open && !parameter.to_top && low <= &lowest && high >= &highest {
+            return Some(could_be(parameter, *low, *high));
+        }
     }
     // At 0 there is none of it; a knee or a frequency is where it is, and none at no value.
     let is_size = |parameter: &Parameter| match parameter.search {
@@ -391,60 +367,6 @@ mod tests {
         assert_eq!(says("ocv-hysteresis", &[[0.01, 0.02], [60.0, 300.0]]), None);
     }
 
-    #[test]
-    fn a_share_of_a_period_that_could_be_twice_itself_says_nothing() {
-        let scale = Scale {
-            step_s: 0.1,
-            span_s: 1000.0,
-            ..Scale::default()
-        };
-        let says = |period: [f64; 2], duty: [f64; 2]| {
-            let member = Member {
-                effect: find("sampled-window").unwrap(),
-                values: vec![period[0], duty[1], 0.0],
-            };
-            shares_of_anything(&scale, &member, &[period, duty, [0.0; 2]])
-        };
-        let why = says([0.43, 2.42], [0.01, 1.0]).unwrap();
-        assert_eq!(why, "period_s could be 0.430 … 2.42");
-        assert_eq!(says([0.43, 0.5], [0.01, 1.0]), None);
-        assert_eq!(says([0.43, 2.42], [0.2, 1.0]), None);
-    }
-
-    /// A beat of two loads, read through effects of these values.
-    fn read_through(truth: &[(String, Vec<f64>)]) -> Problem {
-        let t_s: Vec<f64> = (0..1200).map(|row| 0.1 * f64::from(row)).collect();
-        let current: Vec<f64> = t_s
-            .iter()
-            .map(|t| 40.0 * (1.7 * t).sin() + 20.0 * (4.3 * t).sin())
-            .collect();
-        let mut problem = Problem::pair(t_s.clone(), current, vec![0.0; t_s.len()], 0.1);
-        let read = crate::explain::predict(&problem, truth).into_iter();
-        let noise = t_s.iter().map(|t| 0.14 * (9973.0 * t * t).sin());
-        problem.observed.value = read.zip(noise).map(|(read, noise)| read + noise).collect();
-        problem
-    }
-
-    #[test]
-    fn a_time_that_another_physics_leaves_open_is_taken_back() {
-        let problem = read_through(&[("lag".to_owned(), vec![0.05])]);
-        let bench = Workbench::new(&problem, &[]);
-        let mut selection = select::select(&bench, 0, &mut |_, _| {});
-        let ids = |selection: &Selection| selection.fit.model.ids();
-        assert_eq!(ids(&selection), ["lag"]);
-        let left = dot(&selection.fit.residual, &selection.fit.residual);
-        assert!(!vague_beside(&bench, &mut selection, left));
-        // As it may be ten times as large, or a tenth.
-        let taken = dot(&selection.plain.residual, &selection.plain.residual);
-        assert!(vague_beside(&bench, &mut selection, 25.0 * taken));
-        assert!(!ids(&selection).contains(&"lag"));
-        let why = selection.refused.join("\n");
-        assert!(
-            why.contains("lag: fits, but this recording does not tell its values: tau_s could be"),
-            "{why}"
-        );
-    }
-
     /// A ramp to and fro whose readings saturate beyond 60 A.
     fn saturating(softness: f64) -> Problem {
         let t_s: Vec<f64> = (0..2400).map(|row| 0.1 * f64::from(row)).collect();
@@ -485,7 +407,17 @@ mod tests {
 
     #[test]
     fn a_period_that_another_physics_leaves_open_is_taken_back() {
-        let problem = read_through(&[("sampled-window".to_owned(), vec![0.25, 0.4, 0.03])]);
+        // A beat of two loads, by a sensor that holds the mean of a part of each period.
+        let t_s: Vec<f64> = (0..1200).map(|row| 0.1 * f64::from(row)).collect();
+        let current: Vec<f64> = t_s
+            .iter()
+            .map(|t| 40.0 * (1.7 * t).sin() + 20.0 * (4.3 * t).sin())
+            .collect();
+        let mut problem = Problem::pair(t_s.clone(), current, vec![0.0; t_s.len()], 0.1);
+        let truth = [("sampled-window".to_owned(), vec![0.25, 0.4, 0.03])];
+        let read = crate::explain::predict(&problem, &truth).into_iter();
+        let noise = t_s.iter().map(|t| 0.14 * (9973.0 * t * t).sin());
+        problem.observed.value = read.zip(noise).map(|(read, noise)| read + noise).collect();
         let bench = Workbench::new(&problem, &[]);
         let mut selection = select::select(&bench, 0, &mut |_, _| {});
         let ids = |selection: &Selection| selection.fit.model.ids();
