@@ -726,8 +726,12 @@ fn a_code_for_not_available_is_no_reading() {
         assert_eq!(remarks.len(), 1, "{remarks:?}");
     }
     // Once is a slip, any other value an end of the range, and so is a code's next to the readings.
-    let (problem, _) = one(PAIR, &recording(2, 3276.7, &|k| k == 77));
-    assert_eq!(problem.observed.valid_rows(), 400);
+    let (problem, remarks) = one(PAIR, &recording(2, 3276.7, &|k| k == 77));
+    assert_eq!(problem.observed.valid_rows(), 399);
+    assert!(
+        remarks.join("; ").contains("slips of the log, left out"),
+        "{remarks:?}"
+    );
     for end in [3000.0, 327.0] {
         let (problem, remarks) = one(PAIR, &recording(2, end, &now_and_then));
         assert_eq!(problem.observed.valid_rows(), 400);
