@@ -233,19 +233,24 @@ fn a_power_sensor_in_its_own_words() {
     assert!(end.starts_with("1.01"), "{interval}");
 }
 
-#[test]
-fn a_calibration_of_an_earlier_run_does_not_stay_and_is_said_to_be_removed() {
-    let folder = tempfile::tempdir().unwrap();
-    let folder = folder.path();
+/// A plain sensor's recording and model file, with an offset in A.
+fn write_pair(folder: &Path, offset_a: f64) {
     let mut text = "t_s,i_ref_a,i_meas_a\n".to_owned();
     for k in 0..300 {
         let t_s = f64::from(k) * 0.1;
         let current = 10.0 * (0.37 * t_s).sin();
-        text.push_str(&format!("{t_s},{current},{}\n", current + 0.5));
+        text.push_str(&format!("{t_s},{current},{}\n", current + offset_a));
     }
     fs::write(folder.join("r.csv"), text).unwrap();
-    // No board, nothing to correct.
     fs::write(folder.join("m.toml"), "schema = 1\n[sensor]\n").unwrap();
+}
+
+#[test]
+fn a_calibration_of_an_earlier_run_does_not_stay_and_is_said_to_be_removed() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    // No board, nothing to correct.
+    write_pair(folder, 0.5);
     let said = |output: Output| {
         assert_eq!(output.status.code(), Some(0), "{output:?}");
         String::from_utf8(output.stdout).unwrap()
@@ -293,14 +298,7 @@ fn a_current_is_on_no_axis_of_volts() {
 fn a_recording_comes_through_a_pipe_as_from_a_file() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    let mut text = "t_s,i_ref_a,i_meas_a\n".to_owned();
-    for k in 0..300 {
-        let t_s = f64::from(k) * 0.1;
-        let current = 10.0 * (0.37 * t_s).sin();
-        text.push_str(&format!("{t_s},{current},{current}\n"));
-    }
-    fs::write(folder.join("r.csv"), text).unwrap();
-    fs::write(folder.join("m.toml"), "schema = 1\n[sensor]\n").unwrap();
+    write_pair(folder, 0.0);
     assert_eq!(twin(folder, &command::SIMULATE).status.code(), Some(0));
     let simulated = fs::read(folder.join("s.csv")).unwrap();
     for recording in ["r.csv", "r.parquet"] {

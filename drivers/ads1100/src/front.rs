@@ -88,8 +88,8 @@ macro_rules! methods {
 }
 
 methods! {
-    /// Starts a single conversion. One under way goes on instead (ADS1110 data sheet SBAS276A, operating modes; that of the ADS1100 is
-    /// silent): what comes next is [`Conversion::Discarded`].
+    /// Starts a single conversion. One under way goes on instead (ADS1110 data sheet SBAS276A, operating modes; that page of the
+    /// ADS1100's was not at hand): what comes next is [`Conversion::Discarded`].
     ///
     /// # Errors
     /// [`Error::Bus`]: no conversion counts as under way.

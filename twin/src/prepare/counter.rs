@@ -206,6 +206,7 @@ fn last_digit(ah: &[f64]) -> f64 {
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+    use crate::problem::Problem;
 
     /// Steps of 20 A every ten minutes, logged each minute; the current changes at a share of the interval after which it was logged
     /// first, and a counter of 0.01 Ah counts it, with a factor.
@@ -223,13 +224,7 @@ mod tests {
             (factor * flowed * 100.0).round() / 100.0
         });
         let ah: Vec<f64> = ah.collect();
-        let drive = Drive {
-            segments: std::iter::once(0..t_s.len()).collect(),
-            continues: vec![false],
-            t_s: t_s.into(),
-            reference: reference.into(),
-            ..Drive::default()
-        };
+        let drive = Problem::pair(t_s, reference, ah.clone(), 0.0).drive;
         (drive, ah, flowed)
     }
 
@@ -284,13 +279,7 @@ mod tests {
             .collect();
         let t_s: Vec<f64> = rows.iter().map(|s| *s as f64).collect();
         let ah: Vec<f64> = ah.collect();
-        let drive = Drive {
-            segments: std::iter::once(0..t_s.len()).collect(),
-            continues: vec![false],
-            t_s: t_s.into(),
-            reference: reference.into(),
-            ..Drive::default()
-        };
+        let drive = Problem::pair(t_s, reference, ah.clone(), 0.0).drive;
         (drive, ah, flowed)
     }
 
