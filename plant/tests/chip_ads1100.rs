@@ -527,7 +527,7 @@ proptest! {
         restarts: bool,
         acts in prop::collection::vec(act(), 0..60),
     ) {
-        use ads1100::{Address, Conversion, DataRate, Gain, Settings};
+        use ads1100::{Address, Conversion, DataRate, Error, Gain, Settings};
 
         const RISE_V_PER_S: f64 = 0.5;
         let bench = Rc::new(RefCell::new(Bench::new(Ads1100Config {
@@ -537,11 +537,17 @@ proptest! {
         let mut settings = Settings { data_rate: DataRate::Sps32, gain: Gain::X1 };
         let mut driver = ads1100::Ads1100::new(Hal(bench.clone()), Address::A0, settings);
         let mut started_s = f64::NAN;
+        let mut was_reset = false;
         for act in acts {
             match act {
                 Act::Start => {
                     started_s = bench.borrow().now_s;
-                    driver.start().unwrap();
+                    if let Err(error) = driver.start() {
+                        let lost = matches!(error, Error::ConfigurationLost { .. });
+                        prop_assert!(lost && was_reset, "{}", error);
+                        driver.start().unwrap();
+                    }
+                    was_reset = false;
                 }
                 Act::Poll => {
                     if let Ok(Conversion::Ready(sample)) = driver.poll() {
@@ -568,8 +574,33 @@ proptest! {
                     let mut bench = bench.borrow_mut();
                     let now_s = bench.now_s;
                     bench.chip.reset(now_s);
+                    was_reset = true;
                 }
             }
+        }
+    }
+
+    /// Whatever ended the last conversion, a reset before the next start is told by it.
+    #[test]
+    fn our_driver_sees_a_reset_between_conversions(waits_ms in prop::collection::vec(0..200u32, 1..8)) {
+        use ads1100::{Address, Conversion, DataRate, Error, Gain, Settings};
+
+        let bench = Rc::new(RefCell::new(Bench::new(Ads1100Config::default())));
+        let settings = Settings { data_rate: DataRate::Sps32, gain: Gain::X1 };
+        let mut driver = ads1100::Ads1100::new(Hal(bench.clone()), Address::A0, settings);
+        for wait_ms in waits_ms {
+            driver.start().unwrap();
+            bench.borrow_mut().wait(0.2);
+            prop_assert!(matches!(driver.poll(), Ok(Conversion::Ready(_) | Conversion::Discarded)));
+            bench.borrow_mut().wait(f64::from(wait_ms) * 1e-3);
+            {
+                let mut bench = bench.borrow_mut();
+                let now_s = bench.now_s;
+                bench.chip.reset(now_s);
+            }
+            let lost = Error::ConfigurationLost { expected: 0x94, read: 0x8C };
+            prop_assert_eq!(driver.start(), Err(lost));
+            prop_assert_eq!(driver.poll(), Err(Error::NotStarted));
         }
     }
 }

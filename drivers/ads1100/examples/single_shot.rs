@@ -8,6 +8,7 @@ fn main() -> Result<(), Error<ErrorKind>> {
     let mut bus = Mock::new(&[
         Transaction::write(0x48, vec![0x94]),
         Transaction::read(0x48, vec![0x00, 0x00, 0x14]),
+        Transaction::read(0x48, vec![0x00, 0x00, 0x14]),
         Transaction::write(0x48, vec![0x94]),
         Transaction::read(0x48, vec![0x00, 0x00, 0x94]),
         Transaction::read(0x48, vec![0x10, 0x00, 0x14]),

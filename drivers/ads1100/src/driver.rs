@@ -48,6 +48,8 @@ pub(crate) struct Core<T> {
     first: bool,
     /// When it was started another one may have been under way.
     restarted: bool,
+    /// What was last written to the configuration register, if it is known that the chip took it.
+    written: Option<u8>,
 }
 
 impl<T> Core<T> {
@@ -59,6 +61,7 @@ impl<T> Core<T> {
             state: State::Idle,
             first: true,
             restarted: false,
+            written: None,
         }
     }
 
@@ -92,6 +95,7 @@ impl<T> Core<T> {
 #[both_flavours]
 impl<I2C: embedded_hal_async::i2c::I2c> Core<Asynchronous<I2C>> {
     async fn write(&mut self, configuration: u8) -> Result<(), Error<I2C::Error>> {
+        self.written = None;
         let result = self
             .transport
             .0
@@ -100,7 +104,9 @@ impl<I2C: embedded_hal_async::i2c::I2c> Core<Asynchronous<I2C>> {
         result.map_err(|source| Error::Bus {
             operation: Operation::WriteConfiguration,
             source,
-        })
+        })?;
+        self.written = Some(configuration);
+        Ok(())
     }
 
     /// Code and busy flag of a three-byte read whose configuration is as written, disregarding ST/BSY.
@@ -121,6 +127,7 @@ impl<I2C: embedded_hal_async::i2c::I2c> Core<Asynchronous<I2C>> {
     fn lost(&mut self, expected: u8, read: u8) -> Error<I2C::Error> {
         self.state = State::Idle;
         self.first = true;
+        self.written = None;
         Error::ConfigurationLost { expected, read }
     }
 
@@ -135,6 +142,10 @@ impl<I2C: embedded_hal_async::i2c::I2c> Core<Asynchronous<I2C>> {
     }
 
     pub(crate) async fn start(&mut self) -> Result<(), Error<I2C::Error>> {
+        if let (State::Idle, Some(written)) = (self.state, self.written) {
+            // After a reset since the last result the chip would end its own conversion first, and the write would hide it.
+            self.read(written).await?;
+        }
         self.abandon();
         let result = self.write(ST_BSY | SC | self.settings.bits()).await;
         // The chip may have taken it.
@@ -183,6 +194,7 @@ impl<I2C: embedded_hal_async::i2c::I2c> Core<Asynchronous<I2C>> {
     pub(crate) async fn general_call_reset(&mut self) -> Result<(), Error<I2C::Error>> {
         self.state = State::Idle;
         self.first = true;
+        self.written = None;
         let result = self
             .transport
             .0

@@ -91,8 +91,11 @@ methods! {
     /// Starts a single conversion. One under way goes on instead (ADS1110 data sheet SBAS276A, operating modes; that page of the
     /// ADS1100's was not at hand): what comes next is [`Conversion::Discarded`].
     ///
+    /// Between conversions the configuration is read first, since writing it would hide a reset.
+    ///
     /// # Errors
-    /// [`Error::Bus`]: no conversion counts as under way.
+    /// [`Error::ConfigurationLost`] after a reset or a brown-out since the last result (start again); [`Error::Bus`]. No conversion
+    /// counts as under way then.
     fn start() -> ();
 
     /// Reads code and configuration, and delivers the result once the conversion has finished.

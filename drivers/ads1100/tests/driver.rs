@@ -37,6 +37,11 @@ fn settings(data_rate: DataRate, gain: Gain) -> Settings {
     Settings { data_rate, gain }
 }
 
+/// What a start reads at 0x48 when the last conversion, with 32 SPS and gain 1, is over.
+fn idle() -> Transaction {
+    Transaction::read(0x48, vec![0, 0, 0x14])
+}
+
 /// Runs `test` with a driver at 0x48, 32 SPS, gain 1 (0x14 when idle, 0x94 when busy) whose first conversion is over.
 fn ready(transactions: &[Transaction], test: impl FnOnce(&mut Ads1100<&mut Mock>)) {
     let start = [
@@ -55,6 +60,7 @@ fn ready(transactions: &[Transaction], test: impl FnOnce(&mut Ads1100<&mut Mock>
 fn a_result_is_delivered_when_finished_and_once() {
     ready(
         &[
+            idle(),
             Transaction::write(0x48, vec![0x94]),
             Transaction::read(0x48, vec![0x01, 0x23, 0x94]),
             Transaction::read(0x48, vec![0xFE, 0xDC, 0x14]),
@@ -91,6 +97,7 @@ fn every_address_rate_and_gain() {
                 let mut mock = Mock::new(&[
                     Transaction::write(0x48 + n, vec![0x80 | bits]),
                     Transaction::read(0x48 + n, vec![0, 0, bits]),
+                    Transaction::read(0x48 + n, vec![0, 0, bits]),
                     Transaction::write(0x48 + n, vec![0x80 | bits]),
                     Transaction::read(0x48 + n, vec![0xFF, 0xFF, bits]),
                 ]);
@@ -123,10 +130,12 @@ fn any_other_configuration_byte_is_a_lost_configuration() {
         }
         ready(
             &[
+                idle(),
                 Transaction::write(0x48, vec![0x94]),
                 Transaction::read(0x48, vec![0x12, 0x34, byte]),
                 Transaction::write(0x48, vec![0x94]),
                 Transaction::read(0x48, vec![0, 0, 0x14]),
+                idle(),
                 Transaction::write(0x48, vec![0x94]),
                 Transaction::read(0x48, vec![0, 1, 0x14]),
             ],
@@ -146,6 +155,32 @@ fn any_other_configuration_byte_is_a_lost_configuration() {
             },
         );
     }
+}
+
+#[test]
+fn a_reset_between_conversions_is_told_by_the_next_start() {
+    ready(
+        &[
+            Transaction::read(0x48, vec![0, 0, 0x8C]),
+            Transaction::write(0x48, vec![0x94]),
+            Transaction::read(0x48, vec![0x12, 0x34, 0x14]),
+            idle(),
+            Transaction::write(0x48, vec![0x94]),
+            Transaction::read(0x48, vec![0, 1, 0x14]),
+        ],
+        |adc| {
+            let lost = Error::ConfigurationLost {
+                expected: 0x94,
+                read: 0x8C,
+            };
+            assert_eq!(adc.start(), Err(lost));
+            assert_eq!(adc.poll(), Err(Error::NotStarted));
+            adc.start().unwrap();
+            assert_eq!(adc.poll(), Ok(Conversion::Discarded));
+            adc.start().unwrap();
+            assert!(matches!(adc.poll(), Ok(Conversion::Ready(sample)) if sample.code == 1));
+        },
+    );
 }
 
 #[test]
@@ -170,6 +205,7 @@ fn a_code_beyond_the_data_rates_range_is_an_error() {
             let mut mock = Mock::new(&[
                 Transaction::write(0x48, vec![0x80 | bits]),
                 Transaction::read(0x48, vec![0, 0, bits]),
+                Transaction::read(0x48, vec![0, 0, bits]),
                 Transaction::write(0x48, vec![0x80 | bits]),
                 Transaction::read(0x48, vec![high, low, bits]),
             ]);
@@ -193,10 +229,13 @@ fn a_code_beyond_the_data_rates_range_is_an_error() {
 fn bus_errors_keep_their_place_and_source() {
     ready(
         &[
+            idle().with_error(NACK),
+            idle(),
             Transaction::write(0x48, vec![0x94]).with_error(NACK),
             Transaction::write(0x48, vec![0x94]),
             Transaction::read(0x48, vec![0, 0, 0]).with_error(ErrorKind::ArbitrationLoss),
             Transaction::read(0x48, vec![0, 7, 0x14]),
+            idle(),
             Transaction::write(0x48, vec![0x94]),
             Transaction::read(0x48, vec![0, 8, 0x14]),
             Transaction::write(0x48, vec![0x84]).with_error(NACK),
@@ -207,8 +246,10 @@ fn bus_errors_keep_their_place_and_source() {
         ],
         |adc| {
             let error = |operation, source| Error::Bus { operation, source };
-            assert_eq!(adc.start(), Err(error(Operation::WriteConfiguration, NACK)));
-            assert_eq!(adc.poll(), Err(Error::NotStarted));
+            for operation in [Operation::ReadOutput, Operation::WriteConfiguration] {
+                assert_eq!(adc.start(), Err(error(operation, NACK)));
+                assert_eq!(adc.poll(), Err(Error::NotStarted));
+            }
             assert_eq!(adc.start(), Ok(()));
             assert_eq!(
                 adc.poll(),
@@ -241,6 +282,7 @@ fn bus_errors_keep_their_place_and_source() {
 fn a_bus_error_while_restarting_voids_the_conversion_under_way() {
     ready(
         &[
+            idle(),
             Transaction::write(0x48, vec![0x94]),
             Transaction::write(0x48, vec![0x94]).with_error(NACK),
             Transaction::write(0x48, vec![0x84]),
@@ -261,10 +303,12 @@ fn a_bus_error_while_restarting_voids_the_conversion_under_way() {
 fn a_general_call_reset_voids_the_conversion_and_the_next_result() {
     ready(
         &[
+            idle(),
             Transaction::write(0x48, vec![0x94]),
             Transaction::write(0x00, vec![0x06]),
             Transaction::write(0x48, vec![0x94]),
             Transaction::read(0x48, vec![0, 0, 0x14]),
+            idle(),
             Transaction::write(0x48, vec![0x94]),
             Transaction::read(0x48, vec![0, 3, 0x14]),
         ],
@@ -332,8 +376,11 @@ fn continuous_mode() {
 fn new_settings_void_the_conversion_under_way() {
     ready(
         &[
+            idle(),
             Transaction::write(0x48, vec![0x94]),
+            Transaction::read(0x48, vec![0, 0, 0x94]),
             Transaction::write(0x48, vec![0x99]),
+            Transaction::read(0x48, vec![0x10, 0x00, 0x19]),
             Transaction::read(0x48, vec![0x10, 0x00, 0x19]),
             Transaction::write(0x48, vec![0x99]),
             Transaction::read(0x48, vec![0x20, 0x00, 0x19]),
@@ -537,7 +584,9 @@ mod asynchronous {
             Transaction::write(0x4B, vec![0x9C]),
             Transaction::read(0x4B, vec![0x00, 0x00, 0x9C]),
             Transaction::read(0x4B, vec![0x00, 0x00, 0x1C]),
+            Transaction::read(0x4B, vec![0x00, 0x00, 0x1C]),
             Transaction::write(0x4B, vec![0x9C]),
+            Transaction::read(0x4B, vec![0x80, 0x00, 0x1C]),
             Transaction::read(0x4B, vec![0x80, 0x00, 0x1C]),
             Transaction::write(0x4B, vec![0x9C]),
             Transaction::read(0x4B, vec![0x00, 0x00, 0x8C]),
