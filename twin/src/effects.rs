@@ -48,7 +48,7 @@ use crate::problem::{Problem, View};
 use scene::{Scale, Scene};
 
 /// Every effect, in the order of the documentation's table.
-pub static LIBRARY: [&dyn Effect; 39] = [
+pub static LIBRARY: [&dyn Effect; 40] = [
     &offset::Offset,
     &gain::Gain,
     &offset_temperature::OffsetTemperature,
@@ -69,7 +69,8 @@ pub static LIBRARY: [&dyn Effect; 39] = [
     &dead_band::DeadBand,
     &range_handover::RangeHandover,
     &range_mismatch::RangeMismatch,
-    &sensor_self_heating::SensorSelfHeating,
+    &sensor_self_heating::SETTLED,
+    &sensor_self_heating::CUT_OUT,
     &stray_field::StrayField,
     &sampled_window::SampledWindow,
     &coulombic_efficiency::CoulombicEfficiency,

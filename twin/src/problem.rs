@@ -232,6 +232,17 @@ pub struct SensorBase {
     pub quasi_static: bool,
 }
 
+impl SensorBase {
+    /// A value as the converter by design gives it.
+    pub fn stepped(&self, value: f64) -> f64 {
+        if self.step > 0.0 {
+            (value / self.step).round() * self.step
+        } else {
+            value
+        }
+    }
+}
+
 /// A battery as designed: open-circuit voltage and ohmic resistance.
 #[derive(Clone, Debug, Default)]
 pub struct BatteryBase {

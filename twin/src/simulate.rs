@@ -37,11 +37,7 @@ fn sensor(base: &SensorBase, drive: &Drive, observed: &Observed, view: View) -> 
                 _ if observed.on_drive_rows() => drive.reference[row],
                 _ => area.value(segment, now_s),
             };
-            if base.step > 0.0 {
-                (value / base.step).round() * base.step
-            } else {
-                value
-            }
+            base.stepped(value)
         })
         .collect()
 }

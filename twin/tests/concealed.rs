@@ -213,6 +213,73 @@ fn a_sensitivity_error_over_hours_is_no_heat() {
     assert_eq!(report.verdict, Verdict::Explained, "{:?}", report.effects);
 }
 
+/// A log that begins in the middle of a drive begins with the heat of what it does not show: of the first row's current it says nothing.
+#[test]
+fn the_heat_of_a_drive_that_was_under_way() {
+    let (tc_per_a2, tau_s, h) = (2e-6, 60.0, STEP_S / FINE as f64);
+    let mut truth = truth();
+    let kept = (-h / tau_s).exp();
+    for (seed, before_a) in [(61, 0.0), (62, 150.0)] {
+        truth.current_a[0] = 40.0;
+        let fine = fine(&truth);
+        let mut heat = before_a * before_a;
+        let mut reading = vec![fine[0] * (1.0 + tc_per_a2 * heat)];
+        for k in 1..fine.len() {
+            heat = kept * heat + (1.0 - kept) * 0.5 * (fine[k].powi(2) + fine[k - 1].powi(2));
+            if k % FINE == 0 {
+                reading.push(fine[k] * (1.0 + tc_per_a2 * heat));
+            }
+        }
+        let report = explained(&truth, reading, seed, &[]);
+        assert_named(
+            &report,
+            "sensor-self-heating",
+            &[("tc_per_a2", tc_per_a2, 1e-7), ("tau_s", tau_s, 6.0)],
+        );
+        assert_eq!(report.verdict, Verdict::Explained, "{:?}", report.decisions);
+    }
+}
+
+/// A rail cuts off a little of a few large readings of a coarse converter. The smallest reading is as good as a rail to nobody.
+#[test]
+fn a_rail_that_hardly_shows_is_at_its_end() {
+    let truth = truth();
+    let step_a = 1.2;
+    let mut sorted = truth.current_a.clone();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let mut told = 0;
+    for (seed, beyond) in (70..).zip([15, 20, 25, 30, 40, 60]) {
+        let rail_a = sorted[ROWS - beyond];
+        let mut noise = noise(seed, 0.36);
+        let value = truth.current_a.iter().map(|i| {
+            let read = (i.min(rail_a) + noise()) / step_a;
+            step_a * read.round()
+        });
+        let mut problem = problem_of(&truth, value.collect(), Coloured::default());
+        problem.base = Base::Sensor(SensorBase {
+            full_scale: Some(600.0),
+            step: step_a,
+            ..SensorBase::default()
+        });
+        let report = said(problem, seed, &[]);
+        for effect in report
+            .effects
+            .iter()
+            .filter(|effect| effect.id == "clipping")
+        {
+            let names: Vec<&str> = effect.parameters.iter().map(|p| p.name.as_str()).collect();
+            assert_eq!(names, ["high_a"], "{beyond}: {effect:?}");
+            let [low, high] = effect.parameters[0].ci95;
+            assert!(
+                (low..=high).contains(&rail_a),
+                "{beyond}: {rail_a} {effect:?}"
+            );
+            told += 1;
+        }
+    }
+    assert!(told >= 2, "{told}");
+}
+
 #[test]
 fn both_at_once() {
     let truth = truth();

@@ -321,6 +321,18 @@ fn explaining_begins_where_simulating_ends() {
         };
         let there = explain::predict(&problem, &[]);
         assert_eq!(here.len(), there.len());
+        if matches!(problem.base, Base::Sensor(_)) {
+            // What of the readings counts is no matter of what they are.
+            let mut some = problem.clone();
+            some.observed.valid = (0..here.len()).map(|row| row % 7 > 2).collect();
+            let again = explain::predict(&some, &[]);
+            assert!(
+                there
+                    .iter()
+                    .zip(&again)
+                    .all(|(a, b)| a.to_bits() == b.to_bits())
+            );
+        }
         let mut compared = 0;
         for (row, (here, there)) in here.iter().zip(&there).enumerate() {
             if here.is_nan() && there.is_nan() {
@@ -466,6 +478,40 @@ fn an_extended_model_reproduces_the_explanation() {
             }
         }
         assert!(compared > 1000, "{compared}");
+    }
+}
+
+/// Where readings stand for an earlier moment and come in steps by design, they do with effects and without.
+#[test]
+fn steps_and_moments_by_design_hold_with_effects_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let simulated = |keys: &str, effects: &str| {
+        let text = format!("schema = 1\n[sensor]\nfront_end = \"pair\"\n{keys}{effects}");
+        let (model, prepared) = prepared(folder.path(), &text, &recording(), Purpose::Simulate);
+        let written = columns(&model, &prepared);
+        let found = written.iter().find(|(name, _)| name == "i_meas_a");
+        found.unwrap().1.clone()
+    };
+    let offset = "[effects.offset]\noffset_a = 10\n";
+    for keys in [
+        "step = 0.5\n",
+        "alignment_s = 0.04\n",
+        "step = 0.5\nalignment_s = 0.04\n",
+    ] {
+        let [without, with] = ["", offset].map(|effects| simulated(keys, effects));
+        let plain = simulated("", "");
+        let mut moved = 0;
+        for ((without, with), plain) in without.iter().zip(&with).zip(&plain) {
+            assert!(
+                (without + 10.0 - with).abs() < 1e-9,
+                "{keys}: {without} {with}"
+            );
+            if keys.starts_with("step") {
+                assert_eq!((with / 0.5).fract(), 0.0, "{with}");
+            }
+            moved += usize::from((without - plain).abs() > 1e-3);
+        }
+        assert!(moved > 300, "{keys}: {moved}");
     }
 }
 

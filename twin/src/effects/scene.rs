@@ -762,7 +762,7 @@ impl<'a> Scene<'a> {
                 known = (segment, None);
             }
             let last = &mut known.1;
-            for ((value, t), valid) in values.iter_mut().zip(times).zip(&observed.valid[these]) {
+            for (value, t) in values.iter_mut().zip(times) {
                 let t = reference_s(*t);
                 let charge = cursor.integral(total, &self.signal, t, held);
                 if let Some((before_t, before)) = *last
@@ -770,9 +770,8 @@ impl<'a> Scene<'a> {
                 {
                     *value = (charge - before) / (t - before_t);
                 }
-                if *valid || last.is_none() {
-                    *last = Some((t, charge));
-                }
+                // Each reading is a mean since the one before, whether that one counts or not.
+                *last = Some((t, charge));
             }
         }
         self.signal = sampled.into();

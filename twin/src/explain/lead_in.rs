@@ -5,7 +5,7 @@ use super::fit::Fit;
 use super::select::CERTAIN;
 use super::told::short;
 use super::workbench::{Model, Workbench};
-use crate::problem::{Observed, Problem};
+use crate::problem::{Observed, Problem, View};
 
 /// No more than this share of the readings is left out: with more, too little of the recording would be judged.
 const MOST: f64 = 0.1;
@@ -29,7 +29,14 @@ fn reaching_out(problem: &Problem, [before_s, after_s]: [f64; 2]) -> Vec<usize> 
             continue;
         };
         let inside = drive.t_s[segment.start] + before_s..=drive.t_s[last] - after_s;
-        reaching.extend(rows.filter(|&row| !inside.contains(&observed.t_s[row])));
+        // What a counter says is a mean since its reading before.
+        let begin = |row: usize| {
+            let means = problem.view == View::Charge && row > rows.start;
+            observed.t_s[row - usize::from(means)]
+        };
+        let is_inside =
+            |row: usize| inside.contains(&begin(row)) && inside.contains(&observed.t_s[row]);
+        reaching.extend(rows.clone().filter(|&row| !is_inside(row)));
     }
     reaching
 }

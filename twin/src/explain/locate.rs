@@ -323,7 +323,11 @@ fn stretch(
         .count();
     let p_value = (above + 1) as f64 / (DRAWS + 1) as f64;
     let sample_share = (cut(to) - cut(from)) as f64 / count as f64;
-    (p_value <= CHANCE && energy_share > WORTH.min(1.0 + 0.5 * (1.0 - sample_share)) * sample_share)
+    // Where a clock begins anew no time is before another.
+    let goes_on = bench.t_s[cut(from)..cut(to)].is_sorted();
+    (goes_on
+        && p_value <= CHANCE
+        && energy_share > WORTH.min(1.0 + 0.5 * (1.0 - sample_share)) * sample_share)
         .then(|| Location {
             signal: bench.problem.name.clone(),
             kind: LocationKind::Time,

@@ -15,7 +15,7 @@ pub use losses::{beaten, worse};
 pub use obstacle::{CERTAIN, at_end};
 pub use rivals::{does_as_well, joins};
 
-use super::fit::{Fit, fit, other_minimum, polish};
+use super::fit::{Fit, fit, in_the_mean, other_minimum, polish};
 use super::screen::{DRAWS, Entry, screen};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::find;
@@ -96,9 +96,19 @@ impl Selection {
             .zip(&self.ids)
             .map(|(named, id)| (*id, named.placebo_p99))
             .collect();
+        let placed: Vec<(&'static str, Option<String>)> = self
+            .named
+            .iter()
+            .zip(&self.ids)
+            .map(|(named, id)| (*id, named.by_place.clone()))
+            .collect();
         let others = swapped(bench, &self.fit);
         self.named = name(bench, &self.fit, &others, &p99);
         self.ids = self.fit.model.ids();
+        for (named, id) in self.named.iter_mut().zip(&self.ids) {
+            let before = placed.iter().find(|(known, _)| known == id);
+            named.by_place = before.and_then(|(_, by_place)| by_place.clone());
+        }
     }
 }
 
@@ -156,6 +166,14 @@ pub fn select(bench: &Workbench<'_>, seed: u64, progress: &mut dyn FnMut(f64, &s
         decisions: search.decisions,
         refused: search.refused,
     }
+}
+
+/// A fit of a model from which something was taken out, or into which something was put, once it was settled: until nothing moves any
+/// more, without what does nothing, and right in the mean.
+pub(super) fn settled(bench: &Workbench<'_>, from: &Fit) -> Fit {
+    let mut settled = polish(bench, from);
+    marks::idle_off(bench, &mut settled);
+    in_the_mean(bench, settled)
 }
 
 /// What is kept from one step to the next.

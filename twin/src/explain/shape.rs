@@ -8,7 +8,7 @@
 use super::fit::{self, Fit, ahead_of_grid};
 use super::flexible::Features;
 use super::normal::{dot, normal, solve};
-use super::select::{Selection, percent};
+use super::select::{self, Selection, percent};
 use super::slope::change;
 use super::workbench::Workbench;
 use crate::problem::{Base, View};
@@ -127,7 +127,7 @@ pub fn withdraw(
         let id = selection.fit.model.members[index].id();
         selection.refused.push(format!("{id}: {why}"));
         let without = fit::fit(bench, &selection.fit.model.without(index), None);
-        selection.fit = fit::polish(bench, &without);
+        selection.fit = select::settled(bench, &without);
         selection.rename(bench);
     }
 }

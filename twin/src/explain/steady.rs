@@ -10,7 +10,7 @@ use std::ops::Range;
 use super::workbench::drive_row;
 use crate::effects::chain::{Chain, Nuisance};
 use crate::effects::scene::Scale;
-use crate::problem::{Problem, Series};
+use crate::problem::{Base, Problem, Series};
 use crate::standstill::{Evened, evened};
 
 /// It is noise if no more than this share of it is in the reading.
@@ -42,6 +42,10 @@ impl Steady {
         rows: &[usize],
         [y, plain]: [&[f64]; 2],
     ) -> Option<Self> {
+        // What a board reports of the true current goes beside the chain: the reference's noise is in none of it.
+        if matches!(&problem.base, Base::Sensor(base) if !base.reading.is_empty()) {
+            return None;
+        }
         let Evened {
             reference,
             standstills,
@@ -58,6 +62,9 @@ impl Steady {
                 missing -= (y - plain) * noise;
                 there += noise * noise;
             }
+        }
+        if there <= 0.0 {
+            return None;
         }
         let share = (missing / there).min(1.0);
         (share > 1.0 - FOLLOWED).then(|| Self {

@@ -74,6 +74,7 @@ pub(super) fn attribute(bench: &Workbench<'_>, fit: &Fit, locations: &mut [Locat
                         .sum::<f64>(),
                 )
             })
+            .filter(|(_, energy)| *energy > 0.0)
             .max_by(|a, b| a.1.total_cmp(&b.1))
             .map(|(id, _)| id.to_owned());
     }

@@ -165,7 +165,7 @@ fn replace(
             ));
             selection.take(index, better);
         }
-        None => selection.fit = fit::polish(bench, &without),
+        None => selection.fit = select::settled(bench, &without),
     }
     selection.rename(bench);
 }
@@ -213,7 +213,7 @@ fn stand_in(
             && holds(fit)
             && select::does_as_well(bench, fit, &selection.fit, index)
     });
-    found.map(|fit| fit::polish(bench, &fit))
+    found.map(|fit| select::settled(bench, &fit))
 }
 
 /// Of many models the nearest to the readings as they are.

@@ -252,7 +252,7 @@ pub(super) fn veto(
             ids.join(" with ")
         ));
         vetoed.extend(ids);
-        selection.fit = fit::polish(bench, &without);
+        selection.fit = select::settled(bench, &without);
         selection.rename(bench);
     }
     vetoed

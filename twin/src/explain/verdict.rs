@@ -257,10 +257,12 @@ pub(super) fn allowed(bench: &Workbench<'_>, unavoidable: f64) -> f64 {
 /// By how much the mean square of the stated noise that has a memory, in the view's unit squared, can be above the stated one by
 /// chance: over T it has no more than T/τ independent values (its squares' covariance falls as the square of its own).
 fn swing(bench: &Workbench<'_>, coloured: Coloured) -> f64 {
-    let span_s = match bench.t_s.as_slice() {
-        [first, .., last] if last > first => last - first,
-        _ => return 0.0,
-    };
+    // A clock may begin anew.
+    let steps = bench.t_s.windows(2);
+    let span_s: f64 = steps.map(|pair| (pair[1] - pair[0]).max(0.0)).sum();
+    if span_s <= 0.0 {
+        return 0.0;
+    }
     select::CERTAIN * coloured.rms.powi(2) * (2.0 * coloured.tau_s / span_s).sqrt()
 }
 

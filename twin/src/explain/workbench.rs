@@ -562,7 +562,12 @@ impl<'a> Workbench<'a> {
         let mut before = None;
         for (value, t) in series.iter_mut().zip(&self.t_s) {
             if let Some(before) = before.replace(*t) {
-                let kept = (-f64::max(t - before, 0.0) / coloured.tau_s).exp();
+                // A clock that begins anew is another operation's.
+                let kept = if *t < before {
+                    0.0
+                } else {
+                    (-(t - before) / coloured.tau_s).exp()
+                };
                 memory = kept * memory + coloured.rms * (1.0 - kept * kept).sqrt() * normal();
             }
             *value = memory + white * normal();
@@ -864,7 +869,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         step_s,
         reading_step_s,
         even_s: match t_s {
-            [first, .., last] if reading_step_s > 0.0 => {
+            [first, .., last] if reading_step_s > 0.0 && last > first => {
                 (last - first) / ((last - first) / reading_step_s).round().max(1.0)
             }
             _ => reading_step_s,

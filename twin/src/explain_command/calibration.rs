@@ -252,9 +252,8 @@ fn remedy(model: &Model, signal: &str, id: &str, parameters: &BTreeMap<String, f
             Remedy::None("it depends on what has flowed before, and a register is a constant")
         }
         "core-saturation" => Remedy::None("it corrects a straight line, not a curve"),
-        "clipping" | "dead-band" if converter => {
-            Remedy::None("what was cut away is not in the reading")
-        }
+        "clipping" => Remedy::None("what was cut away is not in the reading"),
+        "dead-band" if converter => Remedy::None("what was cut away is not in the reading"),
         "dead-band" => Remedy::None(
             "it is the meter chip's own threshold; meter: no-load threshold (0x050C) only says how large, for the uncertainty",
         ),

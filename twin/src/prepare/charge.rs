@@ -106,6 +106,7 @@ pub(super) fn item(
         range_limit: sensor.range_limit,
         held_reference: sensor.held_reference,
         alignment_s: sensor.alignment_s,
+        quasi_static: sensor.quasi_static,
         ..SensorBase::default()
     };
     let mut drive = drive;

@@ -264,14 +264,15 @@ fn line_sigma_a(drive: &Drive, segment: usize) -> f64 {
     let of_same = |index: &usize| numbers[*index] == numbers[segment];
     for index in (0..drive.segments.len()).filter(of_same) {
         let rows = drive.segments[index].clone();
-        for row in rows.start + 1..rows.end {
-            if near_s.contains(&drive.t_s[row - 1]) && near_s.contains(&drive.t_s[row]) {
-                let ends = drive.ends(row, [drive.reference[row - 1], drive.reference[row]]);
-                let [from, to] = ends.map(|end_a| end_a - mean_a);
-                let step_s = drive.t_s[row] - drive.t_s[row - 1];
-                squares += (from * from + from * to + to * to) / 3.0 * step_s;
-                time_s += step_s;
-            }
+        let times = &drive.t_s[rows.clone()];
+        let near = times.partition_point(|t| t < near_s.start())
+            ..times.partition_point(|t| t <= near_s.end());
+        for row in rows.start + near.start + 1..rows.start + near.end {
+            let ends = drive.ends(row, [drive.reference[row - 1], drive.reference[row]]);
+            let [from, to] = ends.map(|end_a| end_a - mean_a);
+            let step_s = drive.t_s[row] - drive.t_s[row - 1];
+            squares += (from * from + from * to + to * to) / 3.0 * step_s;
+            time_s += step_s;
         }
     }
     if time_s > 0.0 {
@@ -321,7 +322,10 @@ fn last_seen(base: &BatteryBase, readings: &Readings<'_>, segment: usize) -> Opt
 
 /// Rows of a segment that were read.
 fn read_rows(observed: &Observed, segment: usize) -> impl Iterator<Item = usize> + '_ {
-    let rows = (0..observed.t_s.len()).filter(move |row| observed.segment_of(*row) == segment);
+    let own = observed.stretches.iter();
+    let rows = own
+        .filter(move |(of, _)| *of == segment)
+        .flat_map(|(_, rows)| rows);
     rows.filter(|row| observed.valid[*row] && observed.value[*row].is_finite())
 }
 

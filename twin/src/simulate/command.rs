@@ -127,10 +127,21 @@ pub fn columns(model: &Model, prepared: &Prepared) -> Vec<(String, Vec<f64>)> {
 /// applied.
 pub fn predicted(item: &Item) -> Vec<f64> {
     let problem = &item.problem;
-    if problem.modelled.is_empty() {
-        super::designed(problem)
-    } else {
-        explain::predict(problem, &[])
+    match &problem.base {
+        Base::Sensor(base) if base.reading.is_empty() => {
+            let mut said = if problem.modelled.is_empty() && base.alignment_s == 0.0 {
+                super::designed(problem)
+            } else {
+                explain::predict(problem, &[])
+            };
+            if problem.view == View::Sensor {
+                said.iter_mut()
+                    .for_each(|value| *value = base.stepped(*value));
+            }
+            said
+        }
+        _ if problem.modelled.is_empty() => super::designed(problem),
+        _ => explain::predict(problem, &[]),
     }
 }
 

@@ -126,25 +126,45 @@ fn missed(bench: &Workbench<'_>, mut now: Fit) -> Fit {
     now
 }
 
-/// Switches off what does nothing: a rail that no reading reaches, or so few that chance does as much.
+/// Switches off what does nothing: a rail that no reading reaches, or so few that chance does as much. What is missed least goes first:
+/// of two rails of which one has to stay, the one that explains something does.
 pub(super) fn idle_off(bench: &Workbench<'_>, now: &mut Fit) {
-    for m in 0..now.model.members.len() {
-        let parameters = now.model.members[m].effect.card().parameters;
-        for (p, parameter) in parameters.iter().enumerate() {
-            if !parameter.off.is_infinite() {
+    while let Some(without) = least_missed(bench, now) {
+        *now = without;
+    }
+}
+
+/// The fit without the rail that readings miss least, if that is not beyond chance and something of its effect is left.
+fn least_missed(bench: &Workbench<'_>, now: &Fit) -> Option<Fit> {
+    let mut least: Option<(f64, Fit)> = None;
+    for (m, member) in now.model.members.iter().enumerate() {
+        let parameters = member.effect.card().parameters.iter();
+        for (p, parameter) in parameters.enumerate() {
+            if !parameter.off.is_infinite() || member.values[p] == parameter.off {
                 continue;
             }
             let mut model = now.model.clone();
             model.members[m].values[p] = parameter.off;
+            if !is_set(&model.members[m]) {
+                continue;
+            }
             let predicted = bench.run(&model);
-            if predicted == now.predicted {
+            let (without, missed) = if predicted == now.predicted {
                 // The same to the last digit: all that was found for the model stands.
-                now.model = model;
-            } else if is_set(&model.members[m]) && !is_missed(bench, now, &predicted) {
-                *now = Fit::of(bench, model, now.cost);
+                let mut same = now.clone();
+                same.model = model;
+                (same, 0.0)
+            } else {
+                let missed = missed_by(bench, now, &predicted);
+                (Fit::of(bench, model, now.cost), missed)
+            };
+            let chance = 0.5 * CERTAIN * CERTAIN;
+            if missed <= chance && least.as_ref().is_none_or(|(least, _)| missed < *least) {
+                least = Some((missed, without));
             }
         }
     }
+    least.map(|(_, without)| without)
 }
 
 /// Whether something is left of an effect.
@@ -154,8 +174,7 @@ fn is_set(member: &Member) -> bool {
     values.any(|(parameter, value)| parameter.off.is_infinite() && value.is_finite())
 }
 
-/// Whether readings tell a simulation from one without a part of it, beyond chance.
-fn is_missed(bench: &Workbench<'_>, with: &Fit, without: &[f64]) -> bool {
-    let without = loss(&bench.residual(without), with.sigma);
-    without - loss(&with.residual, with.sigma) > 0.5 * CERTAIN * CERTAIN
+/// By how much the loss is higher with a simulation without a part of a fit.
+fn missed_by(bench: &Workbench<'_>, with: &Fit, without: &[f64]) -> f64 {
+    loss(&bench.residual(without), with.sigma) - loss(&with.residual, with.sigma)
 }
