@@ -432,20 +432,6 @@ pub fn prepare(configuration: &Configuration, basis: &Basis) -> Prepared {
     }
 }
 
-/// What the zero drift in force is at the sensor's output, rated supply: the key factors are taken of what it leaves, or
-/// the two would correct the same zero twice.
-fn zero_drift_voltage(configuration: &Configuration) -> Microvolts {
-    let output = |current: Microamps| {
-        configuration.front_end.voltage(
-            current,
-            KeyCalibration::RANGE,
-            design::SENSOR_NOMINAL_SUPPLY,
-        )
-    };
-    let drift = configuration.zero_drift.value.get(KeyCalibration::RANGE);
-    output(drift).saturating_sub(output(Microamps::ZERO))
-}
-
 /// When the meter counts by factors that change at `now`.
 fn meter_follows(now: Instant) -> Instant {
     now.checked_add_duration(METER_FOLLOWS).unwrap_or(now)
@@ -793,6 +779,17 @@ impl Measurement {
             .validity
             .without(Validity::SATURATED)
             .is_valid();
+        // The key factors are taken of what the zero drift in force leaves, or the two would correct the same zero twice.
+        let output = |current: Microamps| {
+            configuration.front_end.voltage(
+                current,
+                KeyCalibration::RANGE,
+                self.prepared.converter.supply(),
+            )
+        };
+        let zero = output(Microamps::ZERO);
+        let drift =
+            output(configuration.zero_drift.value.get(KeyCalibration::RANGE)).saturating_sub(zero);
         self.key_outputs = self.key.step(
             &configuration.key_calibration,
             &KeyInputs {
@@ -808,11 +805,11 @@ impl Measurement {
                     .filter(|_| self.meter_causes.is_valid())
                     .map(|at| (at, self.meter.charge_total)),
                 sample: (self.conversions > 0).then_some(KeySample {
-                    voltage: measured.then(|| {
-                        self.reading
-                            .volts
-                            .saturating_sub(zero_drift_voltage(configuration))
-                    }),
+                    voltage: measured.then(|| self.reading.volts.saturating_sub(drift)),
+                    zero: match configuration.front_end {
+                        FrontEnd::ClosedLoop(_) => zero,
+                        _ => configuration.key_calibration.rated_zero,
+                    },
                     range: self.reading.range,
                     at: self.reading.at,
                 }),
