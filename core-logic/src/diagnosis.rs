@@ -190,7 +190,7 @@ diagnoses! {
     24 SocUncertain: "The state of charge is less certain than its limit.",
         "uncertainty limit (`SocConfig`)";
         1000 ms, 10000 ms, Warning, WhileActive, [] [] [IMPLAUSIBLE]
-    25 CellVoltageMissing: "No cell voltage received, so the state of charge cannot be re-anchored.",
+    25 CellVoltageMissing: "No cell voltage received, or only as not available, so the state of charge cannot be re-anchored.",
         "500 ms (`CAN_RECEIVE_TIMEOUT_MS`)";
         5000 ms, 1000 ms, Warning, WhileActive, [] [] []
     26 VehicleStateMissing: "No vehicle state received.",

@@ -1159,6 +1159,11 @@ impl Measurement {
         }
     }
 
+    /// Not received in time, or received as not available.
+    const fn cell_voltage_is_missing(&self) -> bool {
+        !self.vehicle.voltage_fresh || self.cell_voltage.is_none()
+    }
+
     fn environment_is_missing(&self) -> bool {
         self.environment_at
             .is_none_or(|at| elapsed(at, self.now) > ENVIRONMENT_TIMEOUT)
@@ -1246,7 +1251,7 @@ impl Measurement {
                 Code::SocUncertain,
                 self.soc_reading.presented_uncertainty() > SOC_UNCERTAINTY_LIMIT,
             ),
-            (Code::CellVoltageMissing, !self.vehicle.voltage_fresh),
+            (Code::CellVoltageMissing, self.cell_voltage_is_missing()),
             (Code::VehicleStateMissing, !self.vehicle.state_fresh),
             (
                 Code::ChargeRestoredWithLoss,
@@ -1535,7 +1540,7 @@ impl Measurement {
         readings.cell_voltage = Millivolts(clamp_i32(div_round(i64::from(cell.get()), 1_000)));
         readings.pack_voltage = self.pack_voltage.unwrap_or_default();
         readings.cell_validity =
-            Validity::VALID.and_if(!self.vehicle.voltage_fresh, Validity::STALE);
+            Validity::VALID.and_if(self.cell_voltage_is_missing(), Validity::STALE);
         readings.supply = self.prepared.supply.unwrap_or_default();
         readings.supply_validity = environment.supply_validity;
         readings.network_voltage = self.environment.network.unwrap_or_default();

@@ -1491,6 +1491,26 @@ fn what_a_calibration_finds_goes_where_it_belongs() {
     assert_eq!(configuration.front_end, FrontEnd::ClosedLoop(closed_loop()));
 }
 
+/// A battery voltage that comes in time and says "not available" is none.
+#[test]
+fn a_cell_voltage_that_is_not_available_is_missing() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.cell_at_4_v();
+    bench.run_ms(6_000);
+    assert!(bench.readings().cell_validity.is_valid() && !bench.has(Code::CellVoltageMissing));
+    let unknown = BatteryVoltage {
+        cell: None,
+        pack: None,
+        cell_temperature: None,
+    };
+    bench
+        .measurement
+        .on_battery_voltage(&unknown, Instant::from_ticks(bench.now));
+    assert_eq!(bench.readings().cell_validity, Validity::STALE);
+    bench.run_ms(6_000);
+    assert!(bench.has(Code::CellVoltageMissing));
+}
+
 #[test]
 fn missing_messages_and_the_key_without_samples_are_reported() {
     let mut bench = Bench::new(Configuration::default());

@@ -332,11 +332,11 @@ inputs! {
     0x0080 I32 1 "state of charge" "ppm" "1,000,000 is full" |r, _| r.soc.get().into();
     0x0082 I32 1 "uncertainty" "ppm" "half-width of the state of charge: the true value lies within plus or minus this" |r, _| r.soc_uncertainty.get().into();
     0x0084 U16 1 "state of charge validity" "bits" "causes; 0 is valid" |r, _| validity(r.soc_validity);
-    0x0085 U16 1 "cell voltage validity" "bits" "causes; 0 is valid" |r, _| validity(r.cell_validity);
+    0x0085 U16 1 "cell voltage validity" "bits" "causes; 0 is valid; not available on CAN counts as stale" |r, _| validity(r.cell_validity);
     0x0086 I64 1 "remaining charge" "mC" "left in the battery" |r, _| mc(r.remaining_charge);
     0x008A U32 1 "anchorings" "" "re-anchorings on the open-circuit voltage" |r, _| r.soc_anchors.into();
     0x008C I32 1 "cell voltage" "mV" "as received on CAN" |r, _| r.cell_voltage.get().into();
-    0x008E I32 1 "pack voltage" "mV" "as received on CAN" |r, _| r.pack_voltage.get().into();
+    0x008E I32 1 "pack voltage" "mV" "as received on CAN; 0 if not available" |r, _| r.pack_voltage.get().into();
 
     // Surroundings.
     0x00A0 I32 1 "sensor supply" "µV" "" |r, _| r.supply.get().into();
