@@ -1525,7 +1525,9 @@ impl Measurement {
         readings.charge_out = self.meter.charge_out;
         readings.charge_uncertainty = self.charge_uncertainty();
         readings.estimated_intervals = self.meter.estimated_intervals;
-        if let Outcome::Disagree { difference, bound } = compared.slow {
+        if let Outcome::Agree { difference, bound } | Outcome::Disagree { difference, bound } =
+            compared.slow
+        {
             (readings.channel_difference, readings.channel_bound) = (difference, bound);
         }
         readings.soc = self.soc_reading.presented;
