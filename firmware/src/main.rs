@@ -1027,7 +1027,6 @@ mod app {
         stored: &Stored<RetainedState>,
         configuration: &Configuration,
     ) -> Start {
-        let policy = &configuration.save_policy;
         let mut start = Start {
             state: None,
             slots: RetainSlots::empty(),
@@ -1042,7 +1041,7 @@ mod app {
             (Ok((state, slots)), _) => {
                 start.state = Some(state);
                 start.slots = slots;
-                start.loss = identity::loss_over_reset(previous, policy);
+                start.loss = identity::loss_over_reset(previous, configuration);
             }
             (Err(_), Stored::Value(state) | Stored::Older(state)) => {
                 start.state = Some(RetainedState {
@@ -1050,7 +1049,7 @@ mod app {
                     key_factors: configuration.key_factors,
                     ..*state
                 });
-                start.loss = identity::loss_over_power_off(policy);
+                start.loss = identity::loss_over_power_off(configuration);
                 if matches!(stored, Stored::Older(_)) {
                     // A save interval more.
                     start.loss = start.loss.saturating_add(start.loss);
