@@ -1245,6 +1245,7 @@ impl Measurement {
                 matches!(self.key_outputs.phase, KeyPhase::Failed(_)),
             ),
             (Code::HvWithoutPermit, self.key_outputs.hv_without_permit),
+            (Code::KeyContradiction, self.key_outputs.key_contradiction),
             (Code::SupplyCalibrationInvalid, has_no_relations),
             (Code::ZeroDriftBeyondLimit, self.zero_beyond_limit),
             (

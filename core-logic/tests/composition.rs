@@ -1491,6 +1491,22 @@ fn what_a_calibration_finds_goes_where_it_belongs() {
     assert_eq!(configuration.front_end, FrontEnd::ClosedLoop(closed_loop()));
 }
 
+/// Line and CAN may follow the key at different times, but not a second apart.
+#[test]
+fn a_key_line_that_contradicts_can_is_reported() {
+    for (acc_line, can_key) in [(false, KeyState::On), (true, KeyState::Off)] {
+        let mut bench = Bench::new(Configuration::default());
+        (bench.vehicle.acc_line, bench.vehicle.can_key) = (acc_line, Some(can_key));
+        bench.run_ms(900);
+        assert!(!bench.has(Code::KeyContradiction));
+        bench.run_ms(300);
+        assert!(bench.has(Code::KeyContradiction));
+        bench.vehicle.acc_line = can_key != KeyState::Off;
+        bench.run_ms(1_300);
+        assert!(!bench.has(Code::KeyContradiction));
+    }
+}
+
 /// A battery voltage that comes in time and says "not available" is none.
 #[test]
 fn a_cell_voltage_that_is_not_available_is_missing() {

@@ -342,7 +342,7 @@ inputs! {
     0x00A0 I32 1 "sensor supply" "µV" "" |r, _| r.supply.get().into();
     0x00A2 I32 1 "network voltage" "µV" "output of the open-sensor network" |r, _| r.network_voltage.get().into();
     0x00A4 I32 1 "controller supply" "mV" "" |r, _| r.mcu_supply.get().into();
-    0x00A6 I32 1 "sensor temperature" "m°C" "" |r, _| r.sensor_temperature.get().into();
+    0x00A6 I32 1 "sensor temperature" "m°C" "of the ADE7753's die" |r, _| r.sensor_temperature.get().into();
     0x00A8 I32 1 "controller temperature" "m°C" "" |r, _| r.board_temperature.get().into();
     0x00AA U16 1 "supply validity" "bits" "causes; 0 is valid" |r, _| validity(r.supply_validity);
     0x00AB U16 1 "temperature validity" "bits" "of the sensor temperature" |r, _| validity(r.temperature_validity);
