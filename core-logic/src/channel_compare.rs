@@ -106,7 +106,12 @@ pub enum Outcome {
     #[default]
     Undecided,
     /// The charges differ by no more than the bound.
-    Agree,
+    Agree {
+        /// Meter less converter.
+        difference: Nanocoulombs,
+        /// What they may differ by.
+        bound: Nanocoulombs,
+    },
     /// They differ by more.
     Disagree {
         /// Meter less converter.
@@ -633,7 +638,7 @@ fn close(
         if difference.saturating_abs() > bound {
             Outcome::Disagree { difference, bound }
         } else {
-            Outcome::Agree
+            Outcome::Agree { difference, bound }
         }
     };
     *window = Some(*now);
@@ -651,6 +656,10 @@ mod tests {
 
     fn at(us: u64) -> Instant {
         Instant::from_ticks(us)
+    }
+
+    fn agrees(outcome: Outcome) -> bool {
+        matches!(outcome, Outcome::Agree { .. })
     }
 
     /// Both channels on a time axis of their own, each seeing what it is made to see.
@@ -753,7 +762,7 @@ mod tests {
         for current in [0, 100, -20_000, 53_000] {
             let mut bench = Bench::new();
             let report = bench.run(25_000, current.into(), current);
-            assert_eq!((report.fast, report.slow), (Outcome::Agree, Outcome::Agree));
+            assert!(agrees(report.fast) && agrees(report.slow), "{report:?}");
             assert!(!report.frozen && !report.meter_lost);
             assert_eq!(report.disagreements, 0);
         }
@@ -792,18 +801,9 @@ mod tests {
     #[test]
     fn small_differences_are_within_the_bound_and_larger_ones_are_not() {
         // 0.79 % of 40 A and 135 mA of zero make 453 mA; the fast window adds two counts in a second, 13 mA.
-        assert_eq!(
-            Bench::new().run(12_000, 40_400, 40_000).fast,
-            Outcome::Agree
-        );
-        assert_eq!(
-            Bench::new().run(12_000, 40_400, 40_000).slow,
-            Outcome::Agree
-        );
-        assert_eq!(
-            Bench::new().run(12_000, 40_440, 40_000).fast,
-            Outcome::Agree
-        );
+        assert!(agrees(Bench::new().run(12_000, 40_400, 40_000).fast));
+        assert!(agrees(Bench::new().run(12_000, 40_400, 40_000).slow));
+        assert!(agrees(Bench::new().run(12_000, 40_440, 40_000).fast));
         for (meter, converter) in [(40_500, 40_000), (-40_500, -40_000), (39_500, 40_000)] {
             let report = Bench::new().run(22_000, meter, converter);
             assert!(
@@ -824,7 +824,7 @@ mod tests {
         bench.uncertainty = 1_000_000_000;
         // 0.7 C in a second.
         let report = bench.run(700, 20_700, 20_000);
-        assert_eq!(report.fast, Outcome::Agree);
+        assert!(agrees(report.fast));
         let report = bench.run(1_500, 20_700, 20_000);
         assert!(matches!(report.fast, Outcome::Disagree { .. }));
     }
@@ -910,7 +910,7 @@ mod tests {
     fn without_usable_conversions_nothing_is_decided() {
         let mut bench = Bench::new();
         let _ = bench.run(1_500, 10_000, 10_000);
-        assert_eq!(bench.compare.report().fast, Outcome::Agree);
+        assert!(agrees(bench.compare.report().fast));
         bench.usable = false;
         let report = bench.run(3_000, 10_000, 0);
         assert_eq!(
@@ -919,7 +919,7 @@ mod tests {
         );
         bench.usable = true;
         let report = bench.run(2_500, 10_000, 10_000);
-        assert_eq!(report.fast, Outcome::Agree);
+        assert!(agrees(report.fast));
     }
 
     #[test]
@@ -927,7 +927,7 @@ mod tests {
         let mut bench = Bench::new();
         bench.config.short_gap_ms = 50;
         let outcomes = |bench: &mut Bench, every: u64| {
-            let mut last = Outcome::Agree;
+            let mut last = Outcome::Undecided;
             for step in 0..120_u64 {
                 bench.usable = step % every == 0;
                 bench.run_until(31, 10_000, 10_000, |_| false);
@@ -938,7 +938,7 @@ mod tests {
         // One conversion in six is 17 %.
         assert_eq!(outcomes(&mut bench, 6), Outcome::Undecided);
         // With every second one spoiled, half is covered and the gaps of 31 ms between.
-        assert_eq!(outcomes(&mut bench, 2), Outcome::Agree);
+        assert!(agrees(outcomes(&mut bench, 2)));
     }
 
     #[test]
@@ -1010,7 +1010,8 @@ mod tests {
         let _ = bench.compare.on_meter(&bench.config, &late);
         assert!(bench.compare.pending.is_some());
         let report = bench.run(2_000, 20_000, 20_000);
-        assert_eq!((report.fast, report.disagreements), (Outcome::Agree, 0));
+        assert!(agrees(report.fast));
+        assert_eq!(report.disagreements, 0);
     }
 
     /// The converter reads by the new factors at once, the meter 60 ms later.
@@ -1025,7 +1026,7 @@ mod tests {
             assert_eq!(report.disagreements, 0, "{report:?}");
             assert!(!report.frozen);
         }
-        assert_eq!(bench.compare.report().fast, Outcome::Agree);
+        assert!(agrees(bench.compare.report().fast));
     }
 
     #[test]
@@ -1046,7 +1047,7 @@ mod tests {
         assert!(!report.meter_lost);
         assert_eq!(report.fast, Outcome::Undecided);
         let report = bench.run(1_500, 10_000, 10_000);
-        assert_eq!(report.fast, Outcome::Agree);
+        assert!(agrees(report.fast));
         assert_eq!(report.disagreements, 0);
         // A meter that never counted says nothing.
         let mut compare = ChannelCompare::new();

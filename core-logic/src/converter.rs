@@ -316,6 +316,7 @@ struct RangeCoefficients {
 pub struct ConverterCoefficients {
     ranges: PerRange<RangeCoefficients>,
     channel: Channel,
+    supply: Microvolts,
     supply_fault: bool,
     stale_after: Duration,
     code_limit: i32,
@@ -358,6 +359,7 @@ impl ConverterCoefficients {
                 large: fold(Range::Large),
             },
             channel,
+            supply,
             supply_fault,
             stale_after: Duration::from_ticks(
                 config.period(channel).as_ticks() * u64::from(config.stale_after_periods),
@@ -384,6 +386,12 @@ impl ConverterCoefficients {
     #[must_use]
     pub const fn configuration(&self) -> u8 {
         self.configuration
+    }
+
+    /// The sensor's supply that the current is worked out with, [`FrontEnd::line`]'s.
+    #[must_use]
+    pub const fn supply(&self) -> Microvolts {
+        self.supply
     }
 
     /// Whether the supply makes every reading invalid.

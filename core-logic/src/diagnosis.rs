@@ -190,7 +190,7 @@ diagnoses! {
     24 SocUncertain: "The state of charge is less certain than its limit.",
         "uncertainty limit (`SocConfig`)";
         1000 ms, 10000 ms, Warning, WhileActive, [] [] [IMPLAUSIBLE]
-    25 CellVoltageMissing: "No cell voltage received, so the state of charge cannot be re-anchored.",
+    25 CellVoltageMissing: "No cell voltage received, or only as not available, so the state of charge cannot be re-anchored.",
         "500 ms (`CAN_RECEIVE_TIMEOUT_MS`)";
         5000 ms, 1000 ms, Warning, WhileActive, [] [] []
     26 VehicleStateMissing: "No vehicle state received.",
@@ -238,6 +238,9 @@ diagnoses! {
     40 SmallSensorOpen: "The small sensor is open; the large one measures in its place with its coarser resolution.",
         "as OpenSensor, with the dual-range front end in the large range";
         0 ms, 1000 ms, Error, WhileActive, [] [] []
+    41 KeyContradiction: "Key line and CAN contradict each other; the line decides, and no key factors are taken.",
+        "OFF by one and not OFF by the other, while VehicleState is received";
+        1000 ms, 1000 ms, Warning, WhileActive, [] [] []
 }
 
 impl Code {
@@ -568,10 +571,10 @@ mod tests {
             assert_eq!(only(code).bits(), 1 << index);
             assert_eq!(std::format!("{code:?}"), code.description().name);
         }
-        assert_eq!(Code::from_number(41), None);
-        assert_eq!(CodeSet::ALL.bits(), (1 << 41) - 1);
+        assert_eq!(Code::from_number(42), None);
+        assert_eq!(CodeSet::ALL.bits(), (1 << 42) - 1);
         assert_eq!(CodeSet::from_bits(u64::MAX), CodeSet::ALL);
-        assert_eq!(CodeSet::ALL.len(), 41);
+        assert_eq!(CodeSet::ALL.len(), 42);
         assert!(CodeSet::EMPTY.is_empty() && !CodeSet::ALL.is_empty());
         let (one, other) = (only(Code::OpenSensor), only(Code::LogFull));
         assert_eq!(one.union(other).difference(other), one);

@@ -5,6 +5,9 @@
 //! - Key **ACC**, low-voltage loads on, high voltage still off: output VC2, `a = VC1 − VC2`.
 //! - Running: `k·(V + a)`, which is exactly VOUT0, that is 0 A, at V = VC2.
 //!
+//! VOUT0 is what the running form takes for 0 A: for D4's own sensor `k2·Vc + m2`, which follows the supply. If the
+//! supply has changed from OFF to ACC, VC1 in `a` is the one that the sensor would have had at the supply in ACC.
+//!
 //! The factors belong to the range in which they were taken: the small one, which passes at 0 A.
 //!
 //! While the key is OFF batches are averaged one after the other and the newest good one is VC1: it is the one closest
@@ -61,7 +64,8 @@ pub enum OnFailure {
 pub struct KeyCalibrationConfig {
     /// Whether factors are taken at all; if not, the permit follows the key without a delay.
     pub enabled: bool,
-    /// VOUT0, the rated output at 0 A.
+    /// VOUT0, the rated output at 0 A, of a sensor whose output is referred to the rated supply. D4's own sensor has
+    /// its second relation for that.
     pub rated_zero: Microvolts,
     /// Samples that are averaged, at least 1.
     pub samples: u16,
@@ -119,6 +123,8 @@ impl Default for KeyCalibrationConfig {
 pub struct KeySample {
     /// The output; `None` when the conversion is not valid.
     pub voltage: Option<Microvolts>,
+    /// VOUT0: the output that is taken for 0 A, at the supply of the moment.
+    pub zero: Microvolts,
     /// The range in which it was converted.
     pub range: Range,
     /// When it was converted. A sample with the time of the one before is the same sample and counts once.
@@ -258,6 +264,8 @@ pub struct KeyCalibration {
     started: bool,
     /// VC1 of this key cycle.
     off_output: Option<Microvolts>,
+    /// VOUT0 at that time.
+    off_zero: Microvolts,
     batch: Batch,
     last_sample: Option<Instant>,
     refusal: Option<KeyRefusal>,
@@ -331,6 +339,7 @@ impl KeyCalibration {
             phase: KeyPhase::Off,
             started: false,
             off_output: None,
+            off_zero: Microvolts::ZERO,
             batch: Batch::EMPTY,
             last_sample: None,
             refusal: None,
@@ -527,20 +536,24 @@ impl KeyCalibration {
             return Err(KeyRefusal::CurrentFlows(current));
         }
         if self.phase == KeyPhase::Off {
-            first_factor(config, batch.mean())?;
+            first_factor(config, sample.zero, batch.mean())?;
             self.off_output = Some(batch.mean());
+            self.off_zero = sample.zero;
             self.refusal = None;
             return Ok(None);
         }
         let off_output = self.off_output.ok_or(KeyRefusal::NoOffValue)?;
-        let a = off_output.saturating_sub(batch.mean());
+        let k_ppb = first_factor(config, self.off_zero, off_output)?;
+        let zero_output = Microvolts(clamp_i32(mul_div(
+            i64::from(sample.zero.get()),
+            i64::from(KeyFactors::K_ONE_PPB),
+            i64::from(k_ppb),
+        )));
+        let a = zero_output.saturating_sub(batch.mean());
         if a.saturating_abs() > config.max_a {
             return Err(KeyRefusal::AOutOfLimits(a));
         }
-        self.factors = KeyFactors {
-            k_ppb: first_factor(config, off_output)?,
-            a,
-        };
+        self.factors = KeyFactors { k_ppb, a };
         self.phase = KeyPhase::Taken;
         self.refusal = None;
         Ok(Some(self.factors))
@@ -548,13 +561,13 @@ impl KeyCalibration {
 }
 
 /// `k = VOUT0 / VC1` in 10⁻⁹.
-fn first_factor(config: &KeyCalibrationConfig, off_output: Microvolts) -> Result<i32, KeyRefusal> {
+fn first_factor(
+    config: &KeyCalibrationConfig,
+    zero: Microvolts,
+    off_output: Microvolts,
+) -> Result<i32, KeyRefusal> {
     let one = i64::from(KeyFactors::K_ONE_PPB);
-    let k = mul_div(
-        i64::from(config.rated_zero.get()),
-        one,
-        i64::from(off_output.get()),
-    );
+    let k = mul_div(i64::from(zero.get()), one, i64::from(off_output.get()));
     let deviation = sub_i64(k, one);
     let allowed = i64::from(config.max_k_deviation_ppm) * 1_000;
     if off_output <= Microvolts::ZERO || abs_i64(deviation) > allowed {
@@ -607,6 +620,7 @@ mod tests {
         calibration: KeyCalibration,
         inputs: KeyInputs,
         voltage: Option<Microvolts>,
+        zero: Microvolts,
         range: Range,
         /// Added to every other sample.
         ripple: i32,
@@ -632,6 +646,7 @@ mod tests {
                     sample: None,
                 },
                 voltage: Some(D4_EXAMPLE_OFF),
+                zero: SENSOR_ZERO,
                 range: Range::Small,
                 ripple: 0,
                 samples: 0,
@@ -665,6 +680,7 @@ mod tests {
                 };
                 self.inputs.sample = Some(KeySample {
                     voltage: self.voltage.map(|v| Microvolts(v.get() + ripple)),
+                    zero: self.zero,
                     range: self.range,
                     at: self.inputs.now,
                 });
@@ -744,6 +760,7 @@ mod tests {
         );
         let mut car = after_off(config);
         car.calibration.off_output = Some(D4_EXAMPLE_OFF);
+        car.calibration.off_zero = SENSOR_ZERO;
         assert!(car.run_ms(1_000).0.hv_permit);
     }
 
@@ -1019,7 +1036,7 @@ mod tests {
         // Exactly 2 %: 2.5 V / 2.5 V · 1.02.
         assert_eq!(
             off(|car| {
-                car.config.rated_zero = Microvolts(2_550_000);
+                car.zero = Microvolts(2_550_000);
                 car.voltage = Some(Microvolts(2_500_000));
             }),
             None
@@ -1033,6 +1050,7 @@ mod tests {
         let sample = |us: u64| {
             Some(KeySample {
                 voltage: Some(D4_EXAMPLE_OFF),
+                zero: SENSOR_ZERO,
                 range: Range::Small,
                 at: Instant::from_ticks(1_000_000 + us),
             })
@@ -1181,6 +1199,24 @@ mod tests {
     }
 
     proptest! {
+        /// The zero output follows the supply, and the low-voltage loads may pull that.
+        #[test]
+        fn acc_reads_0_a_when_the_supply_has_changed_since_off(
+            zero in 2_375_000..2_625_000i32, fall in -50_000..50_000i32, shifts in proptest::array::uniform2(-20_000..20_000i32),
+        ) {
+            let mut car = Car::new(config());
+            car.zero = Microvolts(zero);
+            car.voltage = Some(Microvolts(zero + shifts[0]));
+            car.run_ms(500);
+            car.inputs.acc_line = true;
+            car.zero = Microvolts(zero + fall);
+            let acc = Microvolts(zero + fall + shifts[1]);
+            car.voltage = Some(acc);
+            let factors = car.run_ms(500).1.unwrap();
+            // a is a whole number of microvolts, and k may stretch its half.
+            prop_assert!((factors.apply(acc).get() - car.zero.get()).abs() <= 1);
+        }
+
         #[test]
         fn acc_reads_0_a_whatever_the_outputs_are(off in 2_451_000..2_551_000i32, shift in -50_000..=50_000i32) {
             let mut car = Car::new(config());
@@ -1212,7 +1248,7 @@ mod tests {
                 car.inputs.can_key =
                     [None, Some(KeyState::Off), Some(KeyState::Acc), Some(KeyState::On), Some(KeyState::Start)][usize::from(can)];
                 car.inputs.sample = Some(KeySample {
-                    voltage: Some(Microvolts(voltage)), range: Range::Small, at: car.inputs.now,
+                    voltage: Some(Microvolts(voltage)), zero: SENSOR_ZERO, range: Range::Small, at: car.inputs.now,
                 });
                 let outputs = car.step();
                 if outputs.key == KeyState::Off {
@@ -1268,6 +1304,7 @@ mod tests {
                         .map(|charge| (Instant::from_ticks(now / 2), Nanocoulombs(i64::from(charge) << 31))),
                     sample: sample.map(|(voltage, at)| KeySample {
                         voltage: voltage.map(Microvolts),
+                        zero: Microvolts(wild.1.wrapping_add(wild.3.cast_signed())),
                         range: if flags[3] { Range::Small } else { Range::Large },
                         at: Instant::from_ticks(at),
                     }),

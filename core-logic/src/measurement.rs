@@ -432,20 +432,6 @@ pub fn prepare(configuration: &Configuration, basis: &Basis) -> Prepared {
     }
 }
 
-/// What the zero drift in force is at the sensor's output, rated supply: the key factors are taken of what it leaves, or
-/// the two would correct the same zero twice.
-fn zero_drift_voltage(configuration: &Configuration) -> Microvolts {
-    let output = |current: Microamps| {
-        configuration.front_end.voltage(
-            current,
-            KeyCalibration::RANGE,
-            design::SENSOR_NOMINAL_SUPPLY,
-        )
-    };
-    let drift = configuration.zero_drift.value.get(KeyCalibration::RANGE);
-    output(drift).saturating_sub(output(Microamps::ZERO))
-}
-
 /// When the meter counts by factors that change at `now`.
 fn meter_follows(now: Instant) -> Instant {
     now.checked_add_duration(METER_FOLLOWS).unwrap_or(now)
@@ -793,6 +779,17 @@ impl Measurement {
             .validity
             .without(Validity::SATURATED)
             .is_valid();
+        // The key factors are taken of what the zero drift in force leaves, or the two would correct the same zero twice.
+        let output = |current: Microamps| {
+            configuration.front_end.voltage(
+                current,
+                KeyCalibration::RANGE,
+                self.prepared.converter.supply(),
+            )
+        };
+        let zero = output(Microamps::ZERO);
+        let drift =
+            output(configuration.zero_drift.value.get(KeyCalibration::RANGE)).saturating_sub(zero);
         self.key_outputs = self.key.step(
             &configuration.key_calibration,
             &KeyInputs {
@@ -808,11 +805,11 @@ impl Measurement {
                     .filter(|_| self.meter_causes.is_valid())
                     .map(|at| (at, self.meter.charge_total)),
                 sample: (self.conversions > 0).then_some(KeySample {
-                    voltage: measured.then(|| {
-                        self.reading
-                            .volts
-                            .saturating_sub(zero_drift_voltage(configuration))
-                    }),
+                    voltage: measured.then(|| self.reading.volts.saturating_sub(drift)),
+                    zero: match configuration.front_end {
+                        FrontEnd::ClosedLoop(_) => zero,
+                        _ => configuration.key_calibration.rated_zero,
+                    },
                     range: self.reading.range,
                     at: self.reading.at,
                 }),
@@ -1162,6 +1159,11 @@ impl Measurement {
         }
     }
 
+    /// Not received in time, or received as not available.
+    const fn cell_voltage_is_missing(&self) -> bool {
+        !self.vehicle.voltage_fresh || self.cell_voltage.is_none()
+    }
+
     fn environment_is_missing(&self) -> bool {
         self.environment_at
             .is_none_or(|at| elapsed(at, self.now) > ENVIRONMENT_TIMEOUT)
@@ -1243,13 +1245,14 @@ impl Measurement {
                 matches!(self.key_outputs.phase, KeyPhase::Failed(_)),
             ),
             (Code::HvWithoutPermit, self.key_outputs.hv_without_permit),
+            (Code::KeyContradiction, self.key_outputs.key_contradiction),
             (Code::SupplyCalibrationInvalid, has_no_relations),
             (Code::ZeroDriftBeyondLimit, self.zero_beyond_limit),
             (
                 Code::SocUncertain,
                 self.soc_reading.presented_uncertainty() > SOC_UNCERTAINTY_LIMIT,
             ),
-            (Code::CellVoltageMissing, !self.vehicle.voltage_fresh),
+            (Code::CellVoltageMissing, self.cell_voltage_is_missing()),
             (Code::VehicleStateMissing, !self.vehicle.state_fresh),
             (
                 Code::ChargeRestoredWithLoss,
@@ -1523,7 +1526,9 @@ impl Measurement {
         readings.charge_out = self.meter.charge_out;
         readings.charge_uncertainty = self.charge_uncertainty();
         readings.estimated_intervals = self.meter.estimated_intervals;
-        if let Outcome::Disagree { difference, bound } = compared.slow {
+        if let Outcome::Agree { difference, bound } | Outcome::Disagree { difference, bound } =
+            compared.slow
+        {
             (readings.channel_difference, readings.channel_bound) = (difference, bound);
         }
         readings.soc = self.soc_reading.presented;
@@ -1538,7 +1543,7 @@ impl Measurement {
         readings.cell_voltage = Millivolts(clamp_i32(div_round(i64::from(cell.get()), 1_000)));
         readings.pack_voltage = self.pack_voltage.unwrap_or_default();
         readings.cell_validity =
-            Validity::VALID.and_if(!self.vehicle.voltage_fresh, Validity::STALE);
+            Validity::VALID.and_if(self.cell_voltage_is_missing(), Validity::STALE);
         readings.supply = self.prepared.supply.unwrap_or_default();
         readings.supply_validity = environment.supply_validity;
         readings.network_voltage = self.environment.network.unwrap_or_default();

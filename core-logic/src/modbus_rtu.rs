@@ -314,8 +314,7 @@ impl Server {
                 count(&mut counters.busy);
             }
         }
-        let crc = CRC.checksum(&self.reply).to_le_bytes();
-        let _ = self.reply.extend_from_slice(&crc);
+        self.finish();
         let silence = SILENCE.max(Duration::from_ticks(u64::from(config.turnaround_us)));
         Some(Served {
             reply: Some((
@@ -327,6 +326,30 @@ impl Server {
             )),
             event: outcome.event,
         })
+    }
+
+    /// The frame to send, as [`Server::serve`] and [`Server::refuse`] have left it.
+    #[must_use]
+    pub fn reply(&self) -> &[u8] {
+        &self.reply
+    }
+
+    /// Turns the answer to the command that was just served into exception 04: its order was refused at once.
+    pub fn refuse(&mut self) {
+        // Address and function code stay.
+        self.reply.truncate(2);
+        if let Some(function) = self.reply.last_mut() {
+            *function |= 0x80;
+        }
+        let _ = self.reply.push(Exception::ServerDeviceFailure as u8);
+        self.finish();
+        count(&mut self.receiver.counters.exceptions);
+    }
+
+    #[inline(never)]
+    fn finish(&mut self) {
+        let crc = CRC.checksum(&self.reply).to_le_bytes();
+        let _ = self.reply.extend_from_slice(&crc);
     }
 }
 
@@ -429,6 +452,26 @@ mod tests {
         assert_eq!((MODBUS_CHARACTER_US, SILENCE.as_ticks()), (96, 1_750));
         assert_eq!(GAP_AND_CHARACTER.as_ticks(), 846);
         assert_eq!(SILENCE_AND_CHARACTER.as_ticks(), 1_846);
+    }
+
+    /// Function 0x06 or 0x10: the order was carried out to no effect, and the client is told.
+    #[test]
+    fn an_order_that_is_refused_at_once_is_answered_by_an_exception() {
+        let [high, low] = Command::ZeroNow.register().to_be_bytes();
+        let single = framed(&[1, 6, 0, 0, high, low]);
+        let multiple = framed(&[1, 0x10, 0, 0, 0, 1, 2, high, low]);
+        for (request, function) in [(single, 0x86), (multiple, 0x90)] {
+            let mut line = Line::new();
+            line.bytes(&request);
+            let (reply, event) = line.silence(1_750).unwrap();
+            assert_eq!(event, Some(Event::Command(Command::ZeroNow)));
+            assert_eq!(line.server.reply(), reply.unwrap().0);
+            assert_eq!(line.server.counters().exceptions, 0);
+            line.server.refuse();
+            assert_eq!(line.server.reply(), framed(&[1, function, 4]));
+            let counters = line.server.counters();
+            assert_eq!((counters.exceptions, counters.busy), (1, 0));
+        }
     }
 
     #[test]

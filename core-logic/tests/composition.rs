@@ -285,6 +285,66 @@ fn a_fixed_or_unknown_supply_leaves_the_meter_as_it_is() {
     );
 }
 
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+    /// D4: whatever the supply and the relations that the sweep has found, the key cycle takes its factors and the
+    /// current then reads 0 A in ACC, on both channels, also when the supply falls with the low-voltage loads.
+    #[test]
+    fn a_key_cycle_reads_0_a_at_any_supply_and_by_any_relations(
+        supply_uv in 4_750_000..=5_250_000i32,
+        fall_uv in prop_oneof![Just(0), Just(60_000)],
+        k2_nv_per_v in 490_000_000..=505_000_000i64,
+        m2_nv in -20_000_000..=25_000_000i64,
+        off_shift_v in -0.012f64..0.012,
+        acc_shift_v in -0.012f64..0.012,
+        drift_ua in prop_oneof![Just(0), Just(-800_000)],
+    ) {
+        let relations = SupplyRelations {
+            k2_nanovolt_per_volt: k2_nv_per_v,
+            m2_nanovolt: m2_nv,
+            ..SupplyRelations::default()
+        };
+        let mut configuration = with_front_end(FrontEnd::ClosedLoop(ClosedLoop {
+            relations,
+            ..ClosedLoop::default()
+        }));
+        configuration.zero_drift.value = core_logic::front_end::PerRange::both(Microamps(drift_ua));
+        let mut bench = Bench::new(configuration);
+        // A code is a share of the supply, which is the converter's reference.
+        let code = |shift_v: f64, supply_uv: i32| {
+            let supply_v = f64::from(supply_uv) * 1e-6;
+            let zero_v = (k2_nv_per_v as f64 * supply_v + m2_nv as f64) * 1e-9;
+            ((zero_v + shift_v) / supply_v * 8_192.0).round() as i16
+        };
+        bench.environment.supply = Some(Microvolts(supply_uv));
+        bench.code = code(off_shift_v, supply_uv);
+        bench.run_ms(1_500);
+        bench.vehicle.acc_line = true;
+        bench.environment.supply = Some(Microvolts(supply_uv - fall_uv));
+        bench.code = code(acc_shift_v, supply_uv - fall_uv);
+        bench.run_ms(1_400);
+        let state = bench.measurement.board_state(0, 0);
+        prop_assert_eq!(state.key_calibration, Some(KeyPhase::Taken));
+        bench.run_ms(100);
+        let reading = bench.measurement.current();
+        // A microvolt is 0.16 mA; k is 2 % from one at most, and the drift is taken off in front of it.
+        let bound = 400 + drift_ua.abs() / 50;
+        // The meter of this bench counts nothing, whatever the sensor put out with key OFF.
+        let validity = reading.validity.without(Validity::IMPLAUSIBLE);
+        prop_assert!(
+            validity.is_valid() && reading.current.get().abs() <= bound,
+            "{reading:?}"
+        );
+        // The meter sees the same output above half the supply.
+        let seen_v = f64::from(bench.code) / 8_192.0 * f64::from(supply_uv - fall_uv) * 1e-6;
+        let config = bench.measurement.meter_config(&bench.configuration);
+        let rate = counts_per_second(seen_v, f64::from(supply_uv - fall_uv) * 0.5e-6);
+        let per_count = config.charge_per_count(Range::Small).get() as f64;
+        let meter_a = rate * per_count * 1e-9 - f64::from(config.offset.small.get()) * 1e-6;
+        prop_assert!(meter_a.abs() <= 0.002 + f64::from(bound) * 1e-6, "{meter_a} A");
+    }
+}
+
 /// D2's single sensor and D3's network as the front end in use.
 #[test]
 fn every_front_end_measures() {
@@ -1429,6 +1489,42 @@ fn what_a_calibration_finds_goes_where_it_belongs() {
     configuration.front_end = FrontEnd::ClosedLoop(ClosedLoop::default());
     Found::SupplyRelations(relations).store(&mut configuration);
     assert_eq!(configuration.front_end, FrontEnd::ClosedLoop(closed_loop()));
+}
+
+/// Line and CAN may follow the key at different times, but not a second apart.
+#[test]
+fn a_key_line_that_contradicts_can_is_reported() {
+    for (acc_line, can_key) in [(false, KeyState::On), (true, KeyState::Off)] {
+        let mut bench = Bench::new(Configuration::default());
+        (bench.vehicle.acc_line, bench.vehicle.can_key) = (acc_line, Some(can_key));
+        bench.run_ms(900);
+        assert!(!bench.has(Code::KeyContradiction));
+        bench.run_ms(300);
+        assert!(bench.has(Code::KeyContradiction));
+        bench.vehicle.acc_line = can_key != KeyState::Off;
+        bench.run_ms(1_300);
+        assert!(!bench.has(Code::KeyContradiction));
+    }
+}
+
+/// A battery voltage that comes in time and says "not available" is none.
+#[test]
+fn a_cell_voltage_that_is_not_available_is_missing() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.cell_at_4_v();
+    bench.run_ms(6_000);
+    assert!(bench.readings().cell_validity.is_valid() && !bench.has(Code::CellVoltageMissing));
+    let unknown = BatteryVoltage {
+        cell: None,
+        pack: None,
+        cell_temperature: None,
+    };
+    bench
+        .measurement
+        .on_battery_voltage(&unknown, Instant::from_ticks(bench.now));
+    assert_eq!(bench.readings().cell_validity, Validity::STALE);
+    bench.run_ms(6_000);
+    assert!(bench.has(Code::CellVoltageMissing));
 }
 
 #[test]

@@ -22,6 +22,7 @@ use core_logic::front_end::KeyFactors;
 use core_logic::key_calibration::KeyPhase;
 use core_logic::measurement::{Measurement, Order, Refusal, Vehicle};
 use core_logic::meter::MeterReport;
+use core_logic::modbus::Readings;
 use core_logic::open_sensor::network_output_open;
 use core_logic::range::{EdgeRecorder, Range};
 use core_logic::retained::RetainedState;
@@ -145,6 +146,13 @@ fn d1_counts_the_charge_of_a_mixed_profile_within_the_error_budget() {
         board.world.charge_c
     );
     assert!(board.measurement.charge().validity.is_valid());
+    // What the two channels differ by is there to read while they agree.
+    let mut readings = Readings::default();
+    board
+        .measurement
+        .fill(&Configuration::default(), &mut readings);
+    let (difference, bound) = (readings.channel_difference, readings.channel_bound);
+    assert!(difference != Nanocoulombs::ZERO && difference.saturating_abs() <= bound);
 }
 
 /// D2: a zero drift taken by order makes current *and* charge read zero, and survives in the configuration.

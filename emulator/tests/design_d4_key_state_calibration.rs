@@ -182,6 +182,50 @@ fn permit_waits_for_both_factors_and_acc_then_reads_0_a() {
     assert!(complaints.is_empty(), "{complaints:?}");
 }
 
+/// The zero output of a sensor whose relations a sweep has found, at a supply that is not 5 V: 2.5 V it is nowhere.
+#[test]
+fn at_another_supply_and_with_swept_relations_acc_reads_0_a() {
+    let (k1, k2, m2) = (2.666_666_6, 0.495, 0.02);
+    let firmware = firmware();
+    for supply_v in [4.8, 5.2] {
+        let mut bench = closed_loop(
+            &firmware,
+            Transfer::ClosedLoop {
+                turns: TURNS,
+                k1_ohm_per_v: k1,
+                m1_ohm: 0.0,
+                k2,
+                m2_v: m2,
+            },
+        );
+        bench.set("closed loop: k2", &[495_000_000]);
+        bench.set("closed loop: m2", &[20_000_000]);
+        let off = Row {
+            sensor_supply_v: supply_v,
+            converter_supply_v: supply_v,
+            ..parked()
+        };
+        bench.vehicle(off);
+        bench.run(1.5);
+        bench.vehicle(Row {
+            key: Key::Accessory,
+            output_shift_v: SHIFT_V,
+            ..off
+        });
+        bench.run(3.0);
+        assert_eq!(bench.signal("BoardState", "KeyCalibration"), TAKEN);
+        let k = bench.settings("key factor k")[0] as f64 * 1e-9;
+        let reading = bench.rig.view.average_a();
+        let acc_a = valid_a(&bench, reading);
+        let meter = bench.rig.view.meter_current_a();
+        println!("D4: {supply_v} V: k = {k:.6}, {acc_a:+.3} A in ACC, {meter:?} by the meter");
+        assert!((k - 1.0).abs() <= HALF_CODE_V / 2.4, "{k}");
+        let bound_a = 2.0 * HALF_CODE_V / RATED_V_PER_A * 5.0 / supply_v;
+        assert!(acc_a.abs() <= bound_a, "{reading:?}");
+        assert!(meter.valid().unwrap().abs() <= bound_a + 0.034, "{meter:?}");
+    }
+}
+
 #[test]
 fn while_current_flows_the_permit_is_held_until_the_factors_are_taken() {
     let firmware = firmware();

@@ -2,11 +2,12 @@
 
 use core_logic::{
     can::{Identity, ResetCause as CanCause},
+    configuration::Configuration,
     design_parameters::LARGE_FULL_SCALE,
     diagnosis::Code,
     modbus::Readings,
-    retained::SavePolicyConfig,
-    units::{Duration, Nanocoulombs, charge_of},
+    range::Range,
+    units::{Duration, Microamps, Nanocoulombs, charge_of},
 };
 use stm32f4xx_hal::signature::Uid;
 
@@ -68,13 +69,21 @@ pub fn fill(identity: &Identity, readings: &mut Readings) {
     readings.panic_hash = identity.panic_hash;
 }
 
+/// The current that a loss is reckoned with: full scale of the front end that is set, and no less than D0's.
+fn largest_current(configuration: &Configuration) -> Microamps {
+    configuration
+        .front_end
+        .full_scale(Range::Large)
+        .max(LARGE_FULL_SCALE)
+}
+
 /// Charge that the largest current moves while nobody counts over a reset.
-pub fn loss_over_reset(previous: &Previous, policy: &SavePolicyConfig) -> Nanocoulombs {
+pub fn loss_over_reset(previous: &Previous, configuration: &Configuration) -> Nanocoulombs {
     let bits = previous.cause.bits();
     // The pin alone (every other reset pulls it too), or a supply that sagged and did not break down: RAM outlives both, but
     // nobody knows how long it took.
     if bits == ResetCause::PIN || bits & ResetCause::BROWN_OUT != 0 {
-        return loss_over_power_off(policy);
+        return loss_over_power_off(configuration);
     }
     let by_watchdog = bits & ResetCause::WATCHDOG != 0;
     let time = if by_watchdog {
@@ -82,12 +91,14 @@ pub fn loss_over_reset(previous: &Previous, policy: &SavePolicyConfig) -> Nanoco
     } else {
         RESTART
     };
-    charge_of(LARGE_FULL_SCALE, time)
+    charge_of(largest_current(configuration), time)
 }
 
 /// Charge that can have moved since the last record in flash, which this policy wrote.
-pub fn loss_over_power_off(policy: &SavePolicyConfig) -> Nanocoulombs {
-    policy.loss_bound(LARGE_FULL_SCALE, SAVE_LATENCY)
+pub fn loss_over_power_off(configuration: &Configuration) -> Nanocoulombs {
+    configuration
+        .save_policy
+        .loss_bound(largest_current(configuration), SAVE_LATENCY)
 }
 
 /// The most telling of the causes.

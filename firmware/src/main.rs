@@ -683,29 +683,31 @@ mod app {
                     server.serve(now, &readings, &mut administration.store)
                 });
                 if let Some(served) = served {
+                    let earliest = served.reply.map(|(_, earliest)| earliest);
                     if let Some(Event::Command(command)) = served.event {
                         last_command = u16::from(Command::KEY) << 8 | command as u16;
-                        carry_out(
+                        let is_begun = carry_out(
                             &mut cx.shared.center,
                             &mut cx.shared.administration,
                             command,
                         );
+                        if !is_begun && earliest.is_some() {
+                            server.refuse();
+                        }
                     }
-                    if let Some((reply, earliest)) = served.reply {
+                    if let Some(earliest) = earliest {
                         pace::at_least(until_ms(earliest, time::now())).await;
-                        cx.shared.port.lock(|port| port.send(reply));
+                        cx.shared.port.lock(|port| port.send(server.reply()));
                     }
                 }
             }
 
             let total = server.counters().communication_errors;
-            if total != errors {
-                errors = total;
-                cx.shared
-                    .center
-                    .lock(|center| center.conditions.rs485_errors = true);
-            }
-            let found = cx.shared.center.lock(|center| center.found.take());
+            let found = cx.shared.center.lock(|center| {
+                center.conditions.rs485_errors |= total != errors;
+                center.found.take()
+            });
+            errors = total;
             let check = elapsed(checked, now) >= Duration::from_ticks(1_000_000);
             if check {
                 checked = now;
@@ -741,19 +743,17 @@ mod app {
                 renew = is_sound && matches!(damage, Some(Damage::Configuration));
                 damaged |= damage.is_some();
             }
-            if renew {
-                cx.shared.center.lock(|center| {
+            cx.shared.center.lock(|center| {
+                if renew {
                     center.set_configuration(&active);
                     center.identity.configuration_crc = crc;
-                });
-            }
+                }
+                if check {
+                    center.conditions.configuration_corrupt = damaged;
+                }
+            });
             if is_sound && (check || renew) {
                 hand_limits(&mut cx, &active);
-            }
-            if check {
-                cx.shared
-                    .center
-                    .lock(|center| center.conditions.configuration_corrupt = damaged);
             }
         }
     }
@@ -837,12 +837,12 @@ mod app {
         ];
     }
 
-    /// Carries an order out, or hands it to the storage task.
+    /// Carries an order out, or hands it to the storage task. Whether it was not refused at once.
     fn carry_out(
         center: &mut impl rtic::Mutex<T = Center>,
         administration: &mut impl rtic::Mutex<T = Administration>,
         command: Command,
-    ) {
+    ) -> bool {
         let order = match command {
             Command::ZeroNow => Order::ZeroNow,
             Command::StartKeyCalibration => Order::KeyCalibration,
@@ -851,15 +851,18 @@ mod app {
             Command::FinishSupplyCalibration => Order::FinishSupplyCalibration,
             Command::Abort => Order::Abort,
             Command::ClearDiagnoses => Order::ClearDiagnoses,
-            Command::Save | Command::Restore | Command::ClearLog => {
-                center.lock(|center| center.measurement.note_command(CommandState::Running, 0));
-                administration.lock(|administration| administration.request = Some(command));
-                return;
-            }
-            Command::FactoryDefaults => {
-                administration.lock(|administration| administration.store.factory_defaults());
-                center.lock(|center| center.measurement.note_command(CommandState::Done, 0));
-                return;
+            Command::Save | Command::Restore | Command::ClearLog | Command::FactoryDefaults => {
+                let state = administration.lock(|administration| {
+                    if command == Command::FactoryDefaults {
+                        administration.store.factory_defaults();
+                        CommandState::Done
+                    } else {
+                        administration.request = Some(command);
+                        CommandState::Running
+                    }
+                });
+                center.lock(|center| center.measurement.note_command(state, 0));
+                return true;
             }
         };
         center.lock(|center| {
@@ -868,10 +871,12 @@ mod app {
                 measurement,
                 ..
             } = center;
-            if let Err(refusal) = measurement.order(configuration, order) {
+            let begun = measurement.order(configuration, order);
+            if let Err(refusal) = begun {
                 defmt::info!("order refused: {}", refusal);
             }
-        });
+            begun.is_ok()
+        })
     }
 
     /// Reads the flash, starts the measurement, and then keeps configuration, charge and log. No deadline; a loss of
@@ -1022,7 +1027,6 @@ mod app {
         stored: &Stored<RetainedState>,
         configuration: &Configuration,
     ) -> Start {
-        let policy = &configuration.save_policy;
         let mut start = Start {
             state: None,
             slots: RetainSlots::empty(),
@@ -1037,7 +1041,7 @@ mod app {
             (Ok((state, slots)), _) => {
                 start.state = Some(state);
                 start.slots = slots;
-                start.loss = identity::loss_over_reset(previous, policy);
+                start.loss = identity::loss_over_reset(previous, configuration);
             }
             (Err(_), Stored::Value(state) | Stored::Older(state)) => {
                 start.state = Some(RetainedState {
@@ -1045,7 +1049,7 @@ mod app {
                     key_factors: configuration.key_factors,
                     ..*state
                 });
-                start.loss = identity::loss_over_power_off(policy);
+                start.loss = identity::loss_over_power_off(configuration);
                 if matches!(stored, Stored::Older(_)) {
                     // A save interval more.
                     start.loss = start.loss.saturating_add(start.loss);

@@ -146,9 +146,10 @@ impl Meter {
     /// Whether the chip was just powered, so that a self-test costs no charge. A chip that still holds its
     /// configuration has counted through the reset of the microcontroller.
     ///
-    /// A temperature conversion may still be waiting, for ever: see [`Meter::temperature`].
+    /// A temperature conversion may still be waiting, for ever: see [`Meter::temperature`]. A transfer that CHKSUM shows
+    /// disturbed says nothing: it is repeated, or a chip that counts would be stopped by it.
     pub fn is_fresh(&mut self) -> bool {
-        self.holds_twice(MODE) != Ok(true)
+        (0..ATTEMPTS).find_map(|_| self.holds_twice(MODE).ok()) != Some(true)
     }
 
     /// Whether MODE is as configured. A reset clears it, and a line stuck low reads it as 0.

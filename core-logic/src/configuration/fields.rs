@@ -388,7 +388,7 @@ fields! {
 
     0x0400 U16 1 Standstill (0, 1) "key calibration: enabled" "" "0 off, 1 on" [at key_calibration.enabled];
     0x0401 U16 1 Standstill (0, 1) "key calibration: on failure" "" "0 permit with the previous factors, 1 hold the permit" [at key_calibration.on_failure];
-    0x0402 I32 1 Standstill (1_000_000, 4_000_000) "key calibration: rated zero" "µV" "VOUT0, the rated output at 0 A" [at key_calibration.rated_zero];
+    0x0402 I32 1 Standstill (1_000_000, 4_000_000) "key calibration: rated zero" "µV" "VOUT0, the rated output at 0 A; a closed loop has k2·Vc + m2 in its place" [at key_calibration.rated_zero];
     0x0404 U16 1 Standstill (1, 1_024) "key calibration: samples" "" "that are averaged" [at key_calibration.samples];
     0x0406 U32 1 Standstill (0, 10_000) "key calibration: settling" "ms" "after a change of key or high voltage" [at key_calibration.settle_ms];
     0x0408 U32 1 Standstill (100, 60_000) "key calibration: longest delay" "ms" "of the high-voltage permit" [at key_calibration.max_delay_ms];

@@ -324,7 +324,7 @@ inputs! {
     0x0064 I64 1 "charge in" "mC" "charged since the start; `charge` goes on over it" |r, _| mc(r.charge_in);
     0x0068 I64 1 "charge out" "mC" "discharged since the start" |r, _| mc(r.charge_out);
     0x006C I64 1 "charge uncertainty" "mC" "bound on what the last start, hand-overs and bridged gaps may have cost" |r, _| mc(r.charge_uncertainty);
-    0x0070 I64 1 "channel difference" "mC" "meter less converter over the last window" |r, _| mc(r.channel_difference);
+    0x0070 I64 1 "channel difference" "mC" "meter less converter over the last slow window; 0 if that was undecided" |r, _| mc(r.channel_difference);
     0x0074 I64 1 "channel bound" "mC" "what they may differ by" |r, _| mc(r.channel_bound);
     0x0078 U32 1 "estimated intervals" "" "meter intervals whose split between the ranges was estimated" |r, _| r.estimated_intervals.into();
 
@@ -332,17 +332,17 @@ inputs! {
     0x0080 I32 1 "state of charge" "ppm" "1,000,000 is full" |r, _| r.soc.get().into();
     0x0082 I32 1 "uncertainty" "ppm" "half-width of the state of charge: the true value lies within plus or minus this" |r, _| r.soc_uncertainty.get().into();
     0x0084 U16 1 "state of charge validity" "bits" "causes; 0 is valid" |r, _| validity(r.soc_validity);
-    0x0085 U16 1 "cell voltage validity" "bits" "causes; 0 is valid" |r, _| validity(r.cell_validity);
+    0x0085 U16 1 "cell voltage validity" "bits" "causes; 0 is valid; not available on CAN counts as stale" |r, _| validity(r.cell_validity);
     0x0086 I64 1 "remaining charge" "mC" "left in the battery" |r, _| mc(r.remaining_charge);
     0x008A U32 1 "anchorings" "" "re-anchorings on the open-circuit voltage" |r, _| r.soc_anchors.into();
     0x008C I32 1 "cell voltage" "mV" "as received on CAN" |r, _| r.cell_voltage.get().into();
-    0x008E I32 1 "pack voltage" "mV" "as received on CAN" |r, _| r.pack_voltage.get().into();
+    0x008E I32 1 "pack voltage" "mV" "as received on CAN; 0 if not available" |r, _| r.pack_voltage.get().into();
 
     // Surroundings.
     0x00A0 I32 1 "sensor supply" "µV" "" |r, _| r.supply.get().into();
     0x00A2 I32 1 "network voltage" "µV" "output of the open-sensor network" |r, _| r.network_voltage.get().into();
     0x00A4 I32 1 "controller supply" "mV" "" |r, _| r.mcu_supply.get().into();
-    0x00A6 I32 1 "sensor temperature" "m°C" "" |r, _| r.sensor_temperature.get().into();
+    0x00A6 I32 1 "sensor temperature" "m°C" "of the ADE7753's die" |r, _| r.sensor_temperature.get().into();
     0x00A8 I32 1 "controller temperature" "m°C" "" |r, _| r.board_temperature.get().into();
     0x00AA U16 1 "supply validity" "bits" "causes; 0 is valid" |r, _| validity(r.supply_validity);
     0x00AB U16 1 "temperature validity" "bits" "of the sensor temperature" |r, _| validity(r.temperature_validity);

@@ -6,6 +6,7 @@ use emulator::mcu::rcc::ResetCause;
 use emulator::rig::{Rig, Setup};
 use emulator::scenario::{Contactors, Scenario};
 use emulator::time::Ticks;
+use plant::ade7753::Flip;
 
 use crate::bench::*;
 
@@ -273,6 +274,39 @@ fn fault_f24_the_board_is_back_after_a_hang_or_fault_with_its_charge_and_the_cau
         );
     }
     assert!(beyond.is_empty(), "beyond what is declared: {beyond:?}");
+}
+
+/// A chip that counts goes on through the reset of the microcontroller, also when the first look at it is disturbed: no
+/// self-test stops it, which would short its input by MODE for 100 ms.
+#[test]
+fn fault_f24_a_disturbed_first_look_at_the_meter_does_not_stop_it() {
+    const MODE: u8 = 0x09;
+    let settings_of_mode = |disturbed: usize| {
+        let mut rig = pulse(50.0, 3.0);
+        rig.run_s(1.0).unwrap();
+        let now_s = rig.now_s();
+        board(&mut rig, |board| {
+            board.meter.log_transactions(4_096);
+            for _ in 0..disturbed {
+                board.meter.flip_bits(now_s, MODE, Flip::Mask(1));
+            }
+        });
+        rig.machine.reset(ResetCause::Software);
+        rig.run_s(0.25).unwrap();
+        board(&mut rig, |board| {
+            let all = board.meter.transactions().iter();
+            all.filter(|transaction| transaction.write && transaction.register == MODE)
+                .count()
+        })
+    };
+    let undisturbed = settings_of_mode(0);
+    for disturbed in 1..=2 {
+        let found = settings_of_mode(disturbed);
+        println!(
+            "F24: MODE written {found} times with {disturbed} reads disturbed, else {undisturbed} times"
+        );
+        assert_eq!(found, undisturbed, "{disturbed} reads disturbed");
+    }
 }
 
 /// The pin keeps RAM but may have been held for any time: as much is declared as after a loss of power.

@@ -796,6 +796,25 @@ fn boot_parked(flash: Vec<u8>, timing: Timing, shift_v: f64) -> Rig<'static> {
     rig_of(setup)
 }
 
+/// With a larger sensor more may have flowed while nobody counted.
+#[test]
+fn fault_f24_the_loss_over_a_reset_follows_the_full_scale() {
+    let mut rig = boot_parked(used_flash(), Timing::SLOWEST, 0.0);
+    rig.run_s(0.6).unwrap();
+    let [high, low] = [2_000_000_000_u32 >> 16, 2_000_000_000 & 0xFFFF].map(|word| word as u16);
+    // 60 A and 2,000 A.
+    write_registers(&mut rig, 0x0102, &[0x0393, 0x8700, high, low]).unwrap();
+    // Save.
+    command(&mut rig, 7).unwrap();
+    rig.run_s(1.5).unwrap();
+    rig.machine.reset(ResetCause::Software);
+    rig.view = Default::default();
+    rig.run_s(1.0).unwrap();
+    // 0.6 s.
+    let declared_c = charge_bound_c(&rig);
+    assert!((declared_c - 1_200.0).abs() < 1.0, "{declared_c} C");
+}
+
 #[test]
 fn fault_f24_an_erase_under_way_does_not_cost_the_configuration() {
     let mut rig = boot_parked(used_flash(), Timing::SLOWEST, 0.0);
