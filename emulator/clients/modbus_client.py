@@ -414,7 +414,7 @@ class Client:
         self.report.check("the zero drift is put back after the calibration", answer is None, answer)
 
     def supply_calibration(self):
-        """The first point begins the calibration where the front end has one, else it fails with a reason."""
+        """The first point begins the calibration where the front end has one, else it is refused, and the reason is told."""
         closed_loop = self.board.row(3, self.map.holding("front end"))[0] == 3
         answer = self.board.order("supply point at 0 A")
         state = (self.board.input("command state"), self.board.input("command reason"))
@@ -422,7 +422,7 @@ class Client:
         if closed_loop:
             good = answer is None and state[0] == DONE and points == [1, 0]
         else:
-            good = answer is None and state[0] == FAILED and state[1] != 0 and points == [0, 0]
+            good = answer == FAILURE and state[0] == FAILED and state[1] != 0 and points == [0, 0]
         self.report.check("a supply point is taken only for a closed-loop sensor", good, f"{answer}, {state}, {points}")
         answer = self.board.order("abort")
         self.report.check("nothing is under way", answer is None and self.board.input("calibration under way") == NOTHING)

@@ -23,6 +23,8 @@ RANGE_RATIO = 10.0
 # 2.5 V over the 2 V from zero to full scale: what the zero of a ratiometric sensor stands for, in full scales.
 HALF_SUPPLY_OVER_SPAN = 1.25
 ZERO_C_IN_K = 273.15
+# RT/F at 25 °C: 8.314463 J/(mol·K)·298.15 K over 96485.332 C/mol.
+THERMAL_V = 0.025693
 # Arrhenius temperature of the resistance of usual lithium-ion cells, 1500 … 4000 K.
 USUAL_B_K = 2000.0
 # States of charge that a recording has to pass, as twin's has, for a rise near full to be asked for.
@@ -384,6 +386,8 @@ def battery_entries(recording: Series) -> list[Entry]:
         Entry("capacity", capacity, coefficients=(("relative_change", 0.0),)),
     ]
     out += spread("polarisation", polarisation, "tau_s", times(step, max(span / 2, 4 * step), 2.5), positive=True)
+    exchange = np.geomspace(0.02, 2.0, 7) * np.abs(recording.x).max()
+    out += spread("charge-transfer", charge_transfer, "i0_a", exchange, coefficients=(("share", 0.0),), positive=True)
     slow = times(max(20 * step, 5.0), max(span, 100 * step), 2.5)
     out += spread("diffusion", diffusion, "tau_s", slow, coefficients=(("r_ohm", 0.0),), positive=True)
     gammas, knees = np.geomspace(3, 3000, 7), np.array([0.1, 0.2, 0.35, 0.6])
@@ -405,8 +409,8 @@ def battery_entries(recording: Series) -> list[Entry]:
             Entry("resistance-temperature", arrhenius, positive=True),
             Entry("entropic", lambda s, _: s.battery.cells * warmth(s), coefficients=(("v_per_k", 0.0),)),
         ]
-    else:
-        # Where the temperature is recorded, it holds the warming.
+    if not recording.battery.warmth_recorded:
+        # Where the cell's own temperature is recorded, it holds the warming.
         warm = times(max(10 * step, 10.0), max(span / 2, 100.0), 3.0)
         out += spread("cell-self-heating", cell_heating, "tau_s", warm, positive=True)
     return out
@@ -443,6 +447,12 @@ def count_charge(series: Series, current_a: Array) -> Array:
 def polarisation(series: Series, tau_s: float) -> Array:
     """−LP(i), from rest."""
     return -filters.by_segment(filters.low_pass, series.segments, series.t_s, series.x, tau_s, 0.0)
+
+
+def charge_transfer(series: Series, exchange_a: float) -> Array:
+    """(2RT/F)·(x − asinh x), x = i/(2·i0), at 25 °C: what the slope at small currents promises too much."""
+    x = series.x / (2.0 * exchange_a)
+    return series.battery.cells * 2.0 * THERMAL_V * (x - np.arcsinh(x))
 
 
 def diffusion(series: Series, tau_s: float) -> Array:

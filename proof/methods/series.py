@@ -39,6 +39,8 @@ class Battery:
     # Open-circuit voltage of one cell: state of charge (0 … 1) and V.
     ocv_soc: Array
     ocv_v: Array
+    # Is the cell's own temperature recorded, and not its surroundings' alone?
+    warmth_recorded: bool = False
 
 
 @dataclass
@@ -169,6 +171,7 @@ def battery_series(path: pathlib.Path, table: pd.DataFrame, segments: list[slice
         if name in table and table[name].notna().any():
             other["temperature_c"] = table[name].ffill().bfill().to_numpy(float)
             break
+    battery.warmth_recorded = "temp_cell_c" in table and bool(table["temp_cell_c"].notna().any())
     simulated = static - battery.cells * known_drop(t_s, x, segments, battery, known, other.get("temperature_c"))
     return Series(
         kind="battery",

@@ -272,7 +272,7 @@ fn index(summary: &Summary, folder: &Path) -> String {
     text.push('\n');
 
     if !summary.methods.is_empty() {
-        text.push_str("## Beside what people use today\n\nThe same files, the same held-out data, judged by the same rule; twin on those cases only. \
+        text.push_str("## Beside what people use today\n\nThe same files, the same held-out data, judged by the same rule; twin on all of these cases, PyBOP on the batteries among them. \
             Processor time, without the start of a program.\n\n");
         picture(
             &mut text,

@@ -112,19 +112,14 @@ pub fn judge(truth: &Truth, strength: f64, removed: &[String], said: Option<&Sai
     }
 
     // By its own id with no doubt, or within a class.
-    let exact = |list: &Vec<String>| {
-        said.named.iter().any(|named| {
-            list.contains(&named.id) && named.equals.iter().all(|other| list.contains(other))
-        })
+    let exact = |named: &Named, list: &Vec<String>| {
+        list.contains(&named.id) && named.equals.iter().all(|other| list.contains(other))
     };
-    let within = |list: &Vec<String>| {
-        said.named.iter().any(|named| {
-            list.contains(&named.id) || named.equals.iter().any(|other| list.contains(other))
-        })
+    let within = |named: &Named, list: &Vec<String>| {
+        list.contains(&named.id) || named.equals.iter().any(|other| list.contains(other))
     };
-    let found = wanted.iter().filter(|list| within(list)).count();
-    if found == wanted.len() {
-        return if wanted.iter().all(|list| exact(list)) {
+    if each_has_its_own(&wanted, &said.named, &within) {
+        return if each_has_its_own(&wanted, &said.named, &exact) {
             // Of one effect the name that was said: it may be another one that no observer could tell from it.
             let id = match wanted.as_slice() {
                 [only] => said.named.iter().find(|named| only.contains(&named.id)),
@@ -141,6 +136,21 @@ pub fn judge(truth: &Truth, strength: f64, removed: &[String], said: Option<&Sai
         (None, true) if strength >= PLAIN => judgement(Outcome::Missed, false, "missed"),
         (None, true) => judgement(Outcome::Silent, false, "missed"),
     }
+}
+
+/// Whether each of the hidden effects has a name of its own that fits: one name does not stand for two.
+fn each_has_its_own(
+    wanted: &[&Vec<String>],
+    named: &[Named],
+    fits: &dyn Fn(&Named, &Vec<String>) -> bool,
+) -> bool {
+    let Some((list, others)) = wanted.split_first() else {
+        return true;
+    };
+    (0..named.len()).any(|taken| {
+        let mut left = named.to_vec();
+        fits(&left.remove(taken), list) && each_has_its_own(others, &left, fits)
+    })
 }
 
 /// Parameters of the hidden effects that were named.
@@ -264,6 +274,22 @@ mod tests {
         let both = said("explained", &[("offset", &[]), ("lag", &[])]);
         assert_eq!(outcome(&truth, 10.0, &both), Outcome::Exact);
         assert_eq!(judge(&truth, 10.0, &[], Some(&both)).said, "lag");
+    }
+
+    #[test]
+    fn one_name_does_not_stand_for_two_effects() {
+        let alike: &[&str] = &["lag", "moving-average"];
+        let truth = hidden(&[alike, alike], &[]);
+        let one = said("explained", &[("lag", &[])]);
+        assert_eq!(outcome(&truth, 10.0, &one), Outcome::Part);
+        let both = said("explained", &[("lag", &[]), ("moving-average", &[])]);
+        assert_eq!(outcome(&truth, 10.0, &both), Outcome::Exact);
+        // Whichever of two that fit the first effect is the only one that fits the second.
+        let truth = hidden(&[alike, &["lag"]], &[]);
+        assert_eq!(outcome(&truth, 10.0, &both), Outcome::Exact);
+        let class = said("ambiguous", &[("gain", &["sensor-self-heating"])]);
+        let truth = hidden(&[&["gain"], &["sensor-self-heating"]], &[]);
+        assert_eq!(outcome(&truth, 10.0, &class), Outcome::Part);
     }
 
     #[test]

@@ -183,6 +183,8 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     };
     let calibration = calibration::calibrate(&model, &report);
     report.remarks.extend(calibration.remarks);
+    let elsewhere = acts_elsewhere(&report);
+    report.remarks.extend(elsewhere);
     let extended = extended(&model, &report, &arguments.model, out)?;
     let [json, page, model, registers] = FILES;
     let mut files = vec![
@@ -321,6 +323,33 @@ fn write(folder: &Folder, files: &[(&str, String)]) -> Result<Option<PathBuf>, F
         return Ok(Some(calibration));
     }
     Ok(None)
+}
+
+/// What the model file cannot say: it has one table for an effect in all that a sensor, or a battery, reports.
+fn acts_elsewhere(report: &Report) -> Vec<String> {
+    let effects = report.effects.iter();
+    let told = effects.filter_map(|effect| {
+        let (id, signal) = (&effect.id, &effect.signal);
+        let own = report.models.iter().find(|own| own.signal == *signal)?;
+        let has_it = |other: &str| {
+            let mut effects = report.effects.iter();
+            effects.any(|effect| effect.id == *id && effect.signal == other)
+        };
+        let others: Vec<&str> = report
+            .models
+            .iter()
+            .filter(|other| other.of_battery == own.of_battery)
+            .map(|other| other.signal.as_str())
+            .filter(|other| other != signal && !has_it(other))
+            .collect();
+        (!others.is_empty()).then(|| {
+            let others = others.join(" and ");
+            format!(
+                "{id} was found in {signal} and not in {others}; [effects.{id}] in model.toml acts in both: for {others} leave it out there"
+            )
+        })
+    });
+    told.collect()
 }
 
 /// The model file with what was found.

@@ -318,3 +318,44 @@ fn a_recording_comes_through_a_pipe_as_from_a_file() {
         assert_eq!(fs::read(folder.join("piped.csv")).unwrap(), simulated);
     }
 }
+
+/// A counter with a zero of its own: the model file has one offset for the sensor and its counter, and that is said.
+#[test]
+fn an_effect_of_the_counter_alone_is_said_to_act_in_the_sensor_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let model = "schema = 1\n[sensor]\nfront_end = \"pair\"\nheld_reference = true\nnoise = 0.2\n[charge]\nstep_c = 0.01\n";
+    fs::write(folder.join("m.toml"), model).unwrap();
+    let mut random = ChaCha8Rng::seed_from_u64(5);
+    let mut uniform = move || f64::from(random.next_u32()) / f64::from(u32::MAX);
+    let mut text = "t_s,i_ref_a,i_meas_a,q_meas_c\n".to_owned();
+    let (mut current, mut counted) = (0.0, 0.0);
+    for k in 0..6000 {
+        let noise = 0.2 * ((0..12).map(|_| uniform()).sum::<f64>() - 6.0);
+        if k % 50 == 0 {
+            current = 200.0 * uniform() - 60.0;
+        }
+        text.push_str(&format!(
+            "{:.1},{current},{},{:.2}\n",
+            f64::from(k) * 0.1,
+            current + noise,
+            counted
+        ));
+        counted += (current + 0.5) * 0.1;
+    }
+    fs::write(folder.join("r.csv"), text).unwrap();
+    assert_eq!(explained(folder, &[]).status.code(), Some(0));
+    let report = fs::read_to_string(folder.join("out/report.json")).unwrap();
+    let report: serde_json::Value = serde_json::from_str(&report).unwrap();
+    let effects = report["effects"].as_array().unwrap();
+    assert_eq!(effects.len(), 1, "{effects:?}");
+    assert_eq!(
+        (effects[0]["id"].as_str(), effects[0]["signal"].as_str()),
+        (Some("offset"), Some("q_meas_c"))
+    );
+    let remarks = report["remarks"].to_string();
+    assert!(
+        remarks.contains("offset was found in q_meas_c and not in i_meas_a"),
+        "{remarks}"
+    );
+}
