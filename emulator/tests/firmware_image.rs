@@ -57,16 +57,22 @@ fn a_brown_out_detector_that_is_off_is_told_at_each_start() {
     assert_eq!(told(&mut rig), 1);
 }
 
-/// Errata ES0182: the first revision's prefetch must stay off.
+/// Errata ES0182: the first revision's prefetch must stay off, and it calls itself 0x2000_6411.
 #[test]
 fn the_flash_is_prefetched_but_on_revision_a() {
     let firmware = firmware();
-    for (rev_id, prefetches) in [(0x1000, false), (0x1001, true), (0x100F, true)] {
+    for (idcode, prefetches) in [
+        (0x2000_6411, false),
+        (0x1000_6413, false),
+        (0x1001_6413, true),
+        (0x1007_6413, true),
+        (0x100F_6413, true),
+    ] {
         let mut rig = Rig::new(&firmware, driving(10.0)).unwrap();
-        rig.machine.set_revision(rev_id);
+        rig.machine.set_idcode(idcode);
         rig.run_s(0.1).unwrap();
         rig.machine.flash(|flash| {
-            assert_eq!(flash.prefetch(), prefetches, "{rev_id:#x}");
+            assert_eq!(flash.prefetch(), prefetches, "{idcode:#x}");
             assert_eq!(flash.wait_states(), 5);
         });
     }

@@ -11,7 +11,9 @@ pub const APB1_HZ: u32 = CORE_HZ / 4;
 /// SPI1, among others.
 pub const APB2_HZ: u32 = CORE_HZ / 2;
 
-/// DBGMCU_IDCODE, REV_ID of revision A (RM0090, MCU device ID code).
+/// DBGMCU_IDCODE, DEV_ID of the STM32F405 and REV_ID of revision A (RM0090, MCU device ID code). Revision A itself shows 0x2000 of
+/// DEV_ID 0x411 (errata ES0182, MCU device ID is incorrect).
+const DEVICE: u16 = 0x413;
 const REVISION_A: u16 = 0x1000;
 
 /// Starts crystal and PLL and changes over to them (RM0090, reset and clock control).
@@ -19,7 +21,8 @@ const REVISION_A: u16 = 0x1000;
 /// It waits without a bound, for nothing works without a clock: the watchdog, started before, ends the wait.
 pub fn start(rcc: &RCC, flash: &FLASH, debug: &DBGMCU) {
     // The first revision's prefetch must stay off (errata ES0182, ART accelerator prefetch queue instruction is not supported).
-    let prefetches = debug.idcode().read().rev_id().bits() != REVISION_A;
+    let id = debug.idcode().read();
+    let prefetches = id.dev_id().bits() == DEVICE && id.rev_id().bits() != REVISION_A;
     // Five wait states above 150 MHz at 2.7 … 3.6 V (RM0090, table 10), set before the clock rises.
     flash.acr().write(|w| {
         w.latency().ws5();
