@@ -59,6 +59,8 @@ impl HighTime {
         TIM4::enable(rcc);
         TIM4::reset(rcc);
         timer.psc().write(|w| w.psc().set(time::PRESCALER));
+        // [`HighTime::read`] relies on a wrap at 2^16.
+        timer.arr().write(|w| w.arr().set(u16::MAX));
         timer.ccmr1_input().write(|w| w.cc1s().ti1());
         timer.smcr().write(|w| w.ts().ti1fp1().sms().gated_mode());
         // The prescaler takes effect with an update event.
