@@ -27,10 +27,8 @@ use crate::time::Ticks;
 const PERIPHERALS: (u64, u64) = (0x4000_0000, 0x0008_0000);
 /// DBGMCU, its four registers. Nobody debugs: they keep what is written, and it has no effect.
 const DEBUG: (u64, u64) = (0xE004_2000, 16);
-/// Its first, IDCODE, is DEV_ID of the STM32F405, and REV_ID above (RM0090, MCU device ID code).
-const DEVICE_ID: u32 = 0x413;
-/// Revision Z; A is 0x1000.
-const REVISION_Z: u16 = 0x1001;
+/// Its first, IDCODE, of an STM32F405 (DEV_ID 0x413) of revision Z (RM0090, MCU device ID code).
+const IDCODE: u32 = 0x1001_6413;
 /// Factory values and unique ID.
 const SYSTEM_MEMORY: u64 = 0x1FFF_7A00;
 /// The longest time that a polling loop is let turn at once.
@@ -232,14 +230,13 @@ impl<'table> Machine<'table> {
             held_until: Ticks(0),
             exact: false,
         };
-        machine.set_revision(REVISION_Z);
+        machine.set_idcode(IDCODE);
         machine.power_cycle();
         Ok(machine)
     }
 
-    /// Another revision of the chip, as IDCODE tells it.
-    pub fn set_revision(&mut self, rev_id: u16) {
-        let idcode = u32::from(rev_id) << 16 | DEVICE_ID;
+    /// Another revision of the chip, as its whole IDCODE tells it: revision A's is wrong in DEV_ID as well.
+    pub fn set_idcode(&mut self, idcode: u32) {
         // The register is there.
         let _ = self.debug.write_at(0, &idcode.to_le_bytes());
     }

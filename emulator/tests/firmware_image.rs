@@ -8,6 +8,7 @@ use core_logic::can::layout::{Direction, MESSAGES, Message};
 use emulator::can_frame::CanFrame;
 use emulator::faults::Fault;
 use emulator::mcu::flash_interface::FlashInterface;
+use emulator::mcu::iwdg::{Iwdg, IwdgParameters};
 use emulator::mcu::rcc::ResetCause;
 use emulator::rig::{Firmware, Rig, Setup};
 use emulator::scenario::{Contactors, Key, Row, Scenario};
@@ -57,19 +58,49 @@ fn a_brown_out_detector_that_is_off_is_told_at_each_start() {
     assert_eq!(told(&mut rig), 1);
 }
 
-/// Errata ES0182: the first revision's prefetch must stay off.
+/// Errata ES0182: the first revision's prefetch must stay off, and it calls itself 0x2000_6411.
 #[test]
 fn the_flash_is_prefetched_but_on_revision_a() {
     let firmware = firmware();
-    for (rev_id, prefetches) in [(0x1000, false), (0x1001, true), (0x100F, true)] {
+    for (idcode, prefetches) in [
+        (0x2000_6411, false),
+        (0x1000_6413, false),
+        (0x1001_6413, true),
+        (0x1007_6413, true),
+        (0x100F_6413, true),
+    ] {
         let mut rig = Rig::new(&firmware, driving(10.0)).unwrap();
-        rig.machine.set_revision(rev_id);
+        rig.machine.set_idcode(idcode);
         rig.run_s(0.1).unwrap();
         rig.machine.flash(|flash| {
-            assert_eq!(flash.prefetch(), prefetches, "{rev_id:#x}");
+            assert_eq!(flash.prefetch(), prefetches, "{idcode:#x}");
             assert_eq!(flash.wait_states(), 5);
         });
     }
+}
+
+/// ST's driver lets the watchdog's registers take periods of the *prescaled* clock to come into force, 48 ms at most; 25 ms here. Nothing
+/// feeds a board whose crystal does not swing after the first time: it must not be left with the reset's 7.7 s.
+#[test]
+fn a_slow_watchdog_still_ends_a_start_without_a_crystal() {
+    let firmware = firmware();
+    let mut rig = Rig::new(&firmware, driving(10.0)).unwrap();
+    rig.machine.clocks(|rcc, iwdg| {
+        rcc.set_crystal_swings(false);
+        *iwdg = Iwdg::new(IwdgParameters {
+            lsi_hz: 17_000.0,
+            update_cycles: 17 * 25,
+            ..IwdgParameters::default()
+        });
+    });
+    // The firmware counts its questions: each of them is executed.
+    rig.machine.set_exact(true);
+    rig.run_s(0.06).unwrap();
+    rig.machine.set_exact(false);
+    rig.run_s(2.0).unwrap();
+    let reset = rig.machine.resets().get(1).copied().unwrap();
+    assert_eq!(reset.cause, ResetCause::IndependentWatchdog);
+    assert!((1.85..1.95).contains(&reset.at.seconds()), "{reset:?}");
 }
 
 /// docs/architecture.md: 0.5 ms of jitter; here with a bus that others fill, a client on RS485, a sensor supply that

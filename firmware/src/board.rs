@@ -59,6 +59,8 @@ impl HighTime {
         TIM4::enable(rcc);
         TIM4::reset(rcc);
         timer.psc().write(|w| w.psc().set(time::PRESCALER));
+        // [`HighTime::read`] relies on a wrap at 2^16.
+        timer.arr().write(|w| w.arr().set(u16::MAX));
         timer.ccmr1_input().write(|w| w.cc1s().ti1());
         timer.smcr().write(|w| w.ts().ti1fp1().sms().gated_mode());
         // The prescaler takes effect with an update event.
@@ -95,10 +97,12 @@ pub struct Edges {
 impl Edges {
     /// The edge interrupt, at priority 5; `now` was read before anything else.
     ///
-    /// The pending bit is cleared before the level is read: an edge after that asks for another interrupt.
+    /// The pending bit is cleared before the level is read: an edge after that asks for another interrupt. The APB's bridge takes the
+    /// clear and passes it on later; what is read back has waited for it.
     #[inline]
     pub fn on_interrupt(&mut self, now: Instant) {
         self.flag.clear_interrupt_pending_bit();
+        let _ = self.flag.check_interrupt();
         self.recorder.on_edge(now, self.flag.is_high());
         if self.guard.on_event(&self.config, now) == StormAction::Mask {
             self.flag.disable_interrupt(&mut self.exti);

@@ -11,21 +11,33 @@ pub const APB1_HZ: u32 = CORE_HZ / 4;
 /// SPI1, among others.
 pub const APB2_HZ: u32 = CORE_HZ / 2;
 
-/// DBGMCU_IDCODE, REV_ID of revision A (RM0090, MCU device ID code).
+/// DBGMCU_IDCODE, DEV_ID of the STM32F405 and REV_ID of revision A (RM0090, MCU device ID code). Revision A itself shows 0x2000 of
+/// DEV_ID 0x411 (errata ES0182, MCU device ID is incorrect).
+const DEVICE: u16 = 0x413;
 const REVISION_A: u16 = 0x1000;
+/// ACR.LATENCY for 168 MHz: above 150 MHz at 2.7 … 3.6 V (RM0090, table 10).
+const WAIT_STATES: u8 = 5;
 
 /// Starts crystal and PLL and changes over to them (RM0090, reset and clock control).
 ///
 /// It waits without a bound, for nothing works without a clock: the watchdog, started before, ends the wait.
 pub fn start(rcc: &RCC, flash: &FLASH, debug: &DBGMCU) {
     // The first revision's prefetch must stay off (errata ES0182, ART accelerator prefetch queue instruction is not supported).
-    let prefetches = debug.idcode().read().rev_id().bits() != REVISION_A;
-    // Five wait states above 150 MHz at 2.7 … 3.6 V (RM0090, table 10), set before the clock rises.
+    let id = debug.idcode().read();
+    let prefetches = id.dev_id().bits() == DEVICE && id.rev_id().bits() != REVISION_A;
     flash.acr().write(|w| {
-        w.latency().ws5();
+        w.latency().set(WAIT_STATES);
         w.prften().bit(prefetches);
         w.icen().set_bit();
         w.dcen().set_bit()
+    });
+    // Before the clock rises: five wait states, in force when they are read back, and the prescalers, which work up to 16 AHB cycles
+    // after the write (RM0090, 3.5.1 and RCC_CFGR).
+    while flash.acr().read().latency().bits() != WAIT_STATES {}
+    rcc.cfgr().write(|w| {
+        w.hpre().div1();
+        w.ppre1().div4();
+        w.ppre2().div2()
     });
     rcc.cr().modify(|_, w| w.hseon().set_bit());
     while rcc.cr().read().hserdy().bit_is_clear() {}
@@ -40,12 +52,7 @@ pub fn start(rcc: &RCC, flash: &FLASH, debug: &DBGMCU) {
     });
     rcc.cr().modify(|_, w| w.pllon().set_bit());
     while rcc.cr().read().pllrdy().bit_is_clear() {}
-    rcc.cfgr().write(|w| {
-        w.hpre().div1();
-        w.ppre1().div4();
-        w.ppre2().div2();
-        w.sw().pll()
-    });
+    rcc.cfgr().modify(|_, w| w.sw().pll());
     while !rcc.cfgr().read().sws().is_pll() {}
 }
 

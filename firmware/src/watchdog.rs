@@ -7,15 +7,17 @@ use stm32f4xx_hal::pac::{DBGMCU, IWDG};
 /// 0.68 … 1.88 s over the tolerance of LSI, 1.0 s nominal.
 const RELOAD: u16 = 1_000 - 1;
 
-/// The start runs from HSI, 16 MHz, and a poll takes at least six clocks.
-const UPDATE_POLLS: u32 = 25_000;
+/// 30 ms at least: the start runs from HSI, 16 MHz, and a poll takes at least six clocks. Should five periods of the *prescaled* clock
+/// be meant (9.4 ms at 17 kHz; ST's driver waits 48 ms for the largest prescaler), it is enough. The watchdog already runs by then,
+/// with the reset's 0.35 s or more.
+const UPDATE_POLLS: u32 = 80_000;
 
 /// The running watchdog.
 pub struct Watchdog(IWDG);
 
 impl Watchdog {
     /// Starts it, and waits until prescaler and reload value have reached its clock domain, five periods of LSI: a feed
-    /// before that would load the reset's 4 s. The wait ends after 10 ms at the latest; the watchdog runs either way.
+    /// before that would load the reset's 4 s. The wait is bounded; the watchdog runs either way.
     pub fn start(iwdg: IWDG, debug: &DBGMCU) -> Self {
         // In an image with debug assertions a breakpoint does not end in a reset. The bit outlives resets: it is cleared as well.
         debug

@@ -36,7 +36,8 @@ pub struct Ads1100Config {
     pub suffix: u8,
     /// A write begins a new conversion in the place of one under way; off: it is ended first.
     pub restarts: bool,
-    /// Deviation of the data rate, 1 = 100 %; off: 0 (commonly quoted: ±0.2).
+    /// Deviation of the data rate, 1 = 100 %; off: 0 (SBAS239, 104 … 184 of 128 SPS, from memory:
+    /// -0.19 … +0.44).
     pub rate_error: f64,
     /// Offset at the input, in V; off: 0.
     pub offset_v: f64,

@@ -33,6 +33,8 @@ const PLLI2SCFGR_RESET: u32 = 0x2000_3000;
 
 const CFGR_SW: u32 = 0b11;
 const CFGR_PRESCALERS: u32 = 0xFCF0;
+/// PPRE1 and PPRE2.
+const CFGR_APB_PRESCALERS: u32 = 0xFC00;
 /// MCO1, MCO2, I2SSRC and RTCPRE: outputs and clocks that this board does not use.
 const CFGR_UNUSED: u32 = 0xFFFF_0000;
 
@@ -475,13 +477,17 @@ impl Rcc {
         u32::try_from(dividend / divisor).or_else(|_| refuse("PLL output".to_owned()))
     }
 
+    fn source_hz(&self, source: Source) -> Result<u32, Unmodelled> {
+        match source {
+            Source::Hsi => Ok(HSI_HZ),
+            Source::Hse => Ok(self.parameters.crystal_hz),
+            Source::Pll => self.pll_hz(),
+        }
+    }
+
     /// The tree fed by `source` with the prescalers of `cfgr`.
     fn clocks_from(&self, source: Source, cfgr: u32) -> Result<Clocks, Unmodelled> {
-        let hz = match source {
-            Source::Hsi => HSI_HZ,
-            Source::Hse => self.parameters.crystal_hz,
-            Source::Pll => self.pll_hz()?,
-        };
+        let hz = self.source_hz(source)?;
         let apb_divider = |shift: u32| match cfgr >> shift & 7 {
             code @ 4.. => 2 << (code - 4),
             _ => 1,
@@ -589,6 +595,17 @@ impl Rcc {
             } else {
                 self.clocks_from(self.source, cfgr)
             }
+        });
+        // A new PPRE works 1 … 16 AHB cycles after the write (RM0090, RCC_CFGR): the old one would divide the new clock.
+        let checked = checked.and_then(|clocks| {
+            let risen = self.source_hz(wanted)? > self.source_hz(self.source)?;
+            if risen && (cfgr ^ old) & CFGR_APB_PRESCALERS != 0 {
+                return Err(unmodelled(
+                    "RCC_CFGR",
+                    "another PPRE in the write that raises SYSCLK: it works up to 16 AHB cycles later",
+                ));
+            }
+            Ok(clocks)
         });
         match checked {
             Ok(clocks) => self.clocks = clocks,
@@ -784,6 +801,12 @@ mod tests {
         rcc
     }
 
+    /// PPRE1 / 4, PPRE2 / 2, then PLL.
+    fn run_from_pll(world: &mut World, rcc: &mut Rcc) {
+        world.write(rcc, CFGR, 0b101 << 10 | 0b100 << 13);
+        world.write(rcc, CFGR, 0b101 << 10 | 0b100 << 13 | 2);
+    }
+
     #[test]
     fn reset_values_are_the_manuals() {
         let mut world = World::default();
@@ -844,8 +867,7 @@ mod tests {
         let mut world = World::default();
         let mut rcc = with_pll(&mut world);
         assert_eq!(rcc.clocks().ahb, 16_000_000);
-        // PPRE1 / 4, PPRE2 / 2, PLL.
-        world.write(&mut rcc, CFGR, 0b101 << 10 | 0b100 << 13 | 2);
+        run_from_pll(&mut world, &mut rcc);
         assert_eq!(world.read(&mut rcc, CFGR) & 0xF, 0b1010);
         assert_eq!(
             rcc.clocks(),
@@ -865,11 +887,31 @@ mod tests {
     fn back_to_hsi_in_one_write() {
         let mut world = World::default();
         let mut rcc = with_pll(&mut world);
-        world.write(&mut rcc, CFGR, 0b101 << 10 | 0b100 << 13 | 2);
+        run_from_pll(&mut world, &mut rcc);
         world.write(&mut rcc, CFGR, 0);
         assert_eq!(rcc.clocks(), Rcc::default().clocks());
         world.write(&mut rcc, CR, 0x83);
         assert_eq!(world.read(&mut rcc, CR) & !0xFF00, 0x83);
+    }
+
+    #[test]
+    fn prescalers_come_before_the_faster_clock() {
+        let mut world = World::default();
+        let mut rcc = with_pll(&mut world);
+        let refused = rcc
+            .write(CFGR, 4, 0b101 << 10 | 0b100 << 13 | 2, &mut world.context())
+            .unwrap_err();
+        assert!(refused.what.contains("PPRE"), "{refused}");
+        assert_eq!(
+            rcc.clocks().ahb,
+            16_000_000,
+            "a refused write leaves nothing"
+        );
+        run_from_pll(&mut world, &mut rcc);
+        assert_eq!(rcc.clocks().ahb, 168_000_000);
+        // Down again in one write: the old dividers are for more than the new clock.
+        world.write(&mut rcc, CFGR, 0b100 << 10);
+        assert_eq!(rcc.clocks().apb1, 8_000_000);
     }
 
     #[test]
@@ -937,19 +979,18 @@ mod tests {
         }
         let mut world = World::default();
         let mut rcc = with_pll(&mut world);
-        assert!(
-            world.refuses(&mut rcc, CFGR, 0b100 << 13 | 2),
-            "APB1 at 168 MHz"
-        );
-        assert!(
-            world.refuses(&mut rcc, CFGR, 0b101 << 10 | 2),
-            "APB2 at 168 MHz"
-        );
-        assert_eq!(
-            world.read(&mut rcc, CFGR),
-            0,
-            "a refused write leaves nothing"
-        );
+        for (prescalers, bus) in [(0b100 << 13, "APB1"), (0b101 << 10, "APB2")] {
+            world.write(&mut rcc, CFGR, prescalers);
+            let refused = rcc
+                .write(CFGR, 4, prescalers | 2, &mut world.context())
+                .unwrap_err();
+            assert!(refused.what.contains(bus), "{refused}");
+            assert_eq!(
+                world.read(&mut rcc, CFGR),
+                prescalers,
+                "a refused write leaves nothing"
+            );
+        }
         assert!(
             world.refuses(&mut rcc, PLLCFGR, pllcfgr(4, 160, 2, 7, true)),
             "PLLCFGR while on"
@@ -1055,7 +1096,7 @@ mod tests {
     fn system_reset_goes_back_to_hsi() {
         let mut world = World::default();
         let mut rcc = with_pll(&mut world);
-        world.write(&mut rcc, CFGR, 0b101 << 10 | 0b100 << 13 | 2);
+        run_from_pll(&mut world, &mut rcc);
         world.write(&mut rcc, 0x40, 1);
         rcc.reset(&mut world.context());
         assert_eq!(rcc.clocks().ahb, 16_000_000);

@@ -280,7 +280,7 @@ impl State {
         Ok(())
     }
 
-    /// The block at `address`, whose clock has to be on, and the offset in it.
+    /// The block at `address`, whose clock has to be on and whose reset over, and the offset in it.
     fn reach(&self, address: u32) -> Result<(Block, u32), Unmodelled> {
         let Some((block, base, clock)) = Block::at(address) else {
             return Err(Unmodelled {
@@ -292,6 +292,12 @@ impl State {
             return Err(Unmodelled {
                 register: format!("{block:?} at {address:#010X}"),
                 what: format!("an access while RCC keeps the clock of {clock:?} off"),
+            });
+        }
+        if let Some(held) = clock.filter(|held| self.rcc.is_held_in_reset(*held)) {
+            return Err(Unmodelled {
+                register: format!("{block:?} at {address:#010X}"),
+                what: format!("an access while RCC holds {held:?} in reset"),
             });
         }
         Ok((block, address - base))
@@ -651,4 +657,50 @@ fn address(offset: u64) -> Option<u32> {
     u32::try_from(offset)
         .ok()
         .and_then(|offset| BASE.checked_add(offset))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+    use plant::ade7753::{Ade7753, Ade7753Config};
+    use plant::ads1100::{Ads1100, Ads1100Config};
+    use plant::w25q32::{W25q32, W25q32Config};
+
+    use super::*;
+    use crate::board::BoardConfig;
+    use crate::scenario::{Contactors, Row, Scenario};
+
+    #[test]
+    fn a_peripheral_is_reached_with_its_clock_on_and_its_reset_over() {
+        const APB1RSTR: u32 = 0x4002_3820;
+        const APB1ENR: u32 = 0x4002_3840;
+        const TIM4: u32 = 1 << 2;
+        const TIM4_PSC: u32 = 0x4000_0828;
+        let board = Board::new(
+            BoardConfig::default(),
+            Scenario::steady(Row::at_rest(0.0), Contactors::AlwaysClosed),
+            Ade7753::new(Ade7753Config::default(), 0.0),
+            Ads1100::new(Ads1100Config::default(), 0.0),
+            W25q32::with_content(W25q32Config::default(), 0.0, Vec::new()),
+        );
+        let bus = SystemBus::new(board);
+        let mut state = bus.lock();
+        let mut refusal = |writes: &[(u32, u32)]| {
+            for (address, value) in writes {
+                state.write(*address, 4, *value, Ticks(0)).unwrap();
+            }
+            let written = state.write(TIM4_PSC, 4, 1, Ticks(0)).err();
+            let read = state.read(TIM4_PSC, 4, Ticks(0)).err();
+            assert_eq!(written, read);
+            read.map(|refused| refused.what)
+        };
+        assert!(refusal(&[]).unwrap().contains("clock"));
+        assert!(
+            refusal(&[(APB1ENR, TIM4), (APB1RSTR, TIM4)])
+                .unwrap()
+                .contains("reset")
+        );
+        assert_eq!(refusal(&[(APB1RSTR, 0)]), None);
+    }
 }

@@ -15,18 +15,25 @@ const UPDATE: u32 = 1 << 0;
 ///
 /// The gate stops the prescaler as well (RM0090, figure of the block diagram: the trigger controller makes CK_PSC), so
 /// parts of a count add up. *Assumed*: the resynchronisation of TI1 takes as long for a rising edge as for a falling one.
-/// Not modelled: any other mode, flags, interrupts, an auto-reload value other than that after reset.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+/// Not modelled: any other mode, flags, interrupts, an auto-reload value of 0, one changed while it counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tim4 {
     cr1: u32,
     smcr: u32,
     ccmr1: u32,
     psc: u16,
     psc_active: u16,
+    auto_reload: u16,
     count: u16,
     phase: u32,
     at: Ticks,
     gate: bool,
+}
+
+impl Default for Tim4 {
+    fn default() -> Self {
+        Self::new()
+    }
 }
 
 impl Tim4 {
@@ -38,6 +45,7 @@ impl Tim4 {
             ccmr1: 0,
             psc: 0,
             psc_active: 0,
+            auto_reload: u16::MAX,
             count: 0,
             phase: 0,
             at: Ticks(0),
@@ -84,6 +92,18 @@ impl Tim4 {
                 only_bits("TIM4_PSC", value, 0xFFFF)?;
                 self.psc = u16::try_from(value).unwrap_or(u16::MAX);
             }
+            0x2C => {
+                only_bits("TIM4_ARR", value, 0xFFFF)?;
+                let value = u16::try_from(value).unwrap_or(u16::MAX);
+                // Without ARPE it works at once; a counter beyond it, or one that 0 blocks, is nothing the image wants.
+                if value != self.auto_reload && self.cr1 & CEN != 0 {
+                    return Err(unmodelled("TIM4_ARR", "another value while it counts"));
+                }
+                if value == 0 || value < self.count {
+                    return Err(unmodelled("TIM4_ARR", "0, or less than the count"));
+                }
+                self.auto_reload = value;
+            }
             _ => return Err(unknown("TIM4", register, "write")),
         }
         Ok(())
@@ -98,6 +118,7 @@ impl Tim4 {
             0x18 => self.ccmr1,
             0x24 => u32::from(self.count),
             0x28 => u32::from(self.psc),
+            0x2C => u32::from(self.auto_reload),
             _ => return Err(unknown("TIM4", register, "read")),
         })
     }
@@ -146,8 +167,7 @@ impl Peripheral for Tim4 {
         let total = u64::from(self.phase) + clocks;
         let counts = u64::from(self.count) + total / per_count;
         self.phase = (total % per_count) as u32;
-        // Auto-reload at its reset value: the counter wraps.
-        self.count = (counts & 0xFFFF) as u16;
+        self.count = (counts % (u64::from(self.auto_reload) + 1)) as u16;
     }
 
     fn reset(&mut self, context: &mut Context<'_>) {
@@ -172,6 +192,7 @@ mod tests {
     const CCMR1: u32 = 0x18;
     const CNT: u32 = 0x24;
     const PSC: u32 = 0x28;
+    const ARR: u32 = 0x2C;
 
     fn started(world: &mut World) -> Tim4 {
         let mut timer = Tim4::new();
@@ -202,6 +223,25 @@ mod tests {
     }
 
     #[test]
+    fn it_begins_anew_after_its_auto_reload_value() {
+        let mut world = World::default();
+        let mut timer = Tim4::new();
+        assert_eq!(world.read(&mut timer, ARR), 0xFFFF);
+        let mut timer = started(&mut world);
+        assert!(world.refuses(&mut timer, ARR, 99), "while it counts");
+        world.write(&mut timer, ARR, 0xFFFF);
+        world.write(&mut timer, CR1, 0);
+        assert!(world.refuses(&mut timer, ARR, 0));
+        world.write(&mut timer, ARR, 99);
+        world.write(&mut timer, CR1, CEN);
+        timer.set_gate(true, &mut world.context());
+        world.now += Ticks::from_micros(230);
+        assert_eq!(world.read(&mut timer, CNT), 30);
+        timer.reset(&mut world.context());
+        assert_eq!(world.read(&mut timer, ARR), 0xFFFF);
+    }
+
+    #[test]
     fn pulses_shorter_than_a_count_add_up() {
         let mut world = World::default();
         let mut timer = started(&mut world);
@@ -223,7 +263,7 @@ mod tests {
         assert!(world.refuses(&mut timer, CR1, 1 << 2));
         assert!(world.refuses(&mut timer, SMCR, 0b110));
         assert!(world.refuses(&mut timer, CCMR1, 0b10));
-        for offset in [0x04, 0x0C, 0x20, 0x2C, 0x34] {
+        for offset in [0x04, 0x0C, 0x20, 0x34] {
             assert!(world.refuses(&mut timer, offset, 0));
         }
     }
