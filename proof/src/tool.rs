@@ -144,7 +144,7 @@ fn drive_only(kept: &Path, designed: &Path) -> Result<&'static str> {
     let mut reader = csv::Reader::from_path(kept.join(HOLDOUT))?;
     let names = reader.headers()?.clone();
     let is_voltage = |name: &str| VOLTAGES.contains(&name);
-    let keeps = |name: &str| !CHARGES.contains(&name) && !(states_start && is_voltage(name));
+    let keeps = |name: &str| !(CHARGES.contains(&name) || states_start && is_voltage(name));
     let mut writer = csv::Writer::from_path(kept.join(DRIVE))?;
     writer.write_record(names.iter().filter(|name| keeps(name)))?;
     let mut seen = vec![false; names.len()];

@@ -262,9 +262,15 @@ impl FakeBoard {
         self.fill();
         let served = self.server.serve(now, &self.readings, &mut self.store);
         let Some(served) = served else { return };
-        let event = served.event;
-        if let Some((reply, earliest)) = served.reply {
-            let mut reply = reply.to_vec();
+        let earliest = served.reply.map(|(_, earliest)| earliest);
+        if let Some(Event::Command(command)) = served.event
+            && !self.order(command)
+            && earliest.is_some()
+        {
+            self.server.refuse();
+        }
+        if let Some(earliest) = earliest {
+            let mut reply = self.server.reply().to_vec();
             if self.fault == Fault::WordOrder && reply[..3] == [1, 3, 8] {
                 swap_words(&mut reply);
             }
@@ -275,12 +281,10 @@ impl FakeBoard {
                     .map(|(number, byte)| (begin_us + number * CHARACTER_US, byte)),
             );
         }
-        if let Some(Event::Command(command)) = event {
-            self.order(command);
-        }
     }
 
-    fn order(&mut self, command: Command) {
+    /// Carries an order out; whether it is not refused at once.
+    fn order(&mut self, command: Command) -> bool {
         self.readings.last_command = command.register();
         let running = self.calibration_ends_us.is_some();
         self.readings.command_state = match command {
@@ -303,7 +307,9 @@ impl FakeBoard {
             Command::SupplyPointAtZero => CommandState::Failed,
             _ => CommandState::Done,
         };
-        self.readings.command_reason = u16::from(command == Command::SupplyPointAtZero);
+        let is_refused = command == Command::SupplyPointAtZero;
+        self.readings.command_reason = u16::from(is_refused);
+        !is_refused
     }
 
     fn proceed(&mut self) {
