@@ -251,6 +251,7 @@ pub(super) fn name(
             let mut equivalent: Vec<&'static str> = others
                 .iter()
                 .filter(|(at, _)| *at == index)
+                .filter(|(_, other)| !begins_as_it_likes(other))
                 // Two for one are no equal of it.
                 .filter(|(_, other)| other.model.members.len() <= now.model.members.len())
                 .filter(|(_, other)| {
@@ -281,6 +282,13 @@ pub(super) fn name(
             }
         })
         .collect()
+}
+
+/// Whether what the recording began with makes the last effect what is needed: heat that is there from the first row is a gain, to which
+/// it is no equal. (A memory is looked for because of what it began with.)
+fn begins_as_it_likes(fit: &Fit) -> bool {
+    let last = fit.model.members.last();
+    last.is_some_and(|member| member.effect.beginning().is_some() && !member.effect.remembers())
 }
 
 /// Whether a model, whose last effect has the place of one of the chosen model, does as well as that one: what the other effects'
