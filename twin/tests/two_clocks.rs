@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use proptest::prelude::*;
+use proptest::test_runner::RngSeed;
 use twin::align::{Signal, estimate};
 
 const STEP_S: f64 = 0.1;
@@ -134,7 +135,8 @@ fn kinds() -> impl Strategy<Value = Kind> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(16))]
+    // What is claimed here holds but for chance: it is asked of the same draws each time.
+    #![proptest_config(ProptestConfig { cases: 24, rng_seed: RngSeed::Fixed(1), ..ProptestConfig::default() })]
 
     /// Rates up to the 2 % that are promised, to within what noise and rows tell.
     #[test]
@@ -191,6 +193,27 @@ proptest! {
         prop_assert!(refused.starts_with("found no offset and rate at which"), "{refused}");
         prop_assert!(refused.contains("expected recordings of the same run"), "{refused}");
     }
+}
+
+/// Waves of noise's own size, whose next peak looks like the right one; and two runs that are alike where they overlap by a quarter.
+#[test]
+fn the_right_peak_is_found_and_chance_is_not() {
+    for (seed, fast, offset_s) in [(80, -0.007_488, -5.4715), (495, -0.002_31, 5.07)] {
+        let course = drive(Kind::Waves, seed);
+        let found = estimate(
+            &reference(&course),
+            &sensor(&course, fast, offset_s, 8.0, seed),
+        );
+        let late_s =
+            found.unwrap().on_reference(0.5 * SPAN_S) - (0.5 * SPAN_S / (1.0 + fast) + offset_s);
+        assert!(late_s.abs() < STEP_S, "{seed}: off by {late_s} s");
+    }
+    let sensed = sensor(&drive(Kind::Levels, 2446), 0.0, 0.0, 0.05, 446);
+    let refused = estimate(&reference(&drive(Kind::Levels, 446)), &sensed).unwrap_err();
+    assert!(
+        refused.starts_with("found no offset and rate at which"),
+        "{refused}"
+    );
 }
 
 /// Any rate would suit two edges of which one is late: that is the sensor's delay, for all that is known.
