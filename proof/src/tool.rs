@@ -223,6 +223,8 @@ impl Tool {
                 drive,
                 "--out",
                 out,
+                // The squares of what is held out are those of one rounding, as today's methods have it.
+                "--no-step",
             ]);
             if two_clocks {
                 command.args(["--reference", "holdout-reference.csv"]);

@@ -4,7 +4,7 @@ pub mod board;
 pub mod command;
 
 use crate::explain;
-use crate::problem::{Base, Drive, Observed, Problem, SensorBase, View};
+use crate::problem::{Base, Drive, Problem, SensorBase, View};
 
 /// What the simulation as designed says at each observed row, without any effect; NaN where the drive does not reach.
 pub fn designed(problem: &Problem) -> Vec<f64> {
@@ -12,32 +12,40 @@ pub fn designed(problem: &Problem) -> Vec<f64> {
         Base::Sensor(base) if base.reading.len() == problem.observed.t_s.len() => {
             base.reading.clone()
         }
-        Base::Sensor(base) => sensor(base, &problem.drive, &problem.observed, problem.view),
+        Base::Sensor(base) => {
+            let mut said = unrounded(problem, base);
+            if problem.view != View::Charge {
+                for value in &mut said {
+                    *value = base.stepped(*value);
+                }
+            }
+            said
+        }
         Base::Battery(_) => explain::predict(problem, &[]),
     }
 }
 
-/// The reference through window and step; between two readings of a charge counter, its mean.
-fn sensor(base: &SensorBase, drive: &Drive, observed: &Observed, view: View) -> Vec<f64> {
+/// The reference through the window, ahead of the step; between two readings of a charge counter, its mean.
+fn unrounded(problem: &Problem, base: &SensorBase) -> Vec<f64> {
+    let (drive, observed, view) = (&problem.drive, &problem.observed, problem.view);
     let area = Area::new(drive, &drive.reference, base.held_reference);
     let mut last: Option<(usize, f64)> = None;
     (0..observed.t_s.len())
         .map(|row| {
             let (segment, now_s) = (observed.segment_of(row), observed.t_s[row]);
-            let value = match view {
+            match view {
                 View::Charge => {
                     let before =
                         last.filter(|(before, before_s)| *before == segment && now_s > *before_s);
                     last = Some((segment, now_s));
-                    return before.map_or(f64::NAN, |(_, before_s)| {
+                    before.map_or(f64::NAN, |(_, before_s)| {
                         area.mean(segment, before_s, now_s)
-                    });
+                    })
                 }
                 _ if base.window_s > 0.0 => area.mean(segment, now_s - base.window_s, now_s),
                 _ if observed.on_drive_rows() => drive.reference[row],
                 _ => area.value(segment, now_s),
-            };
-            base.stepped(value)
+            }
         })
         .collect()
 }

@@ -25,7 +25,7 @@ use twin::{
     },
     simulate::{
         board::{Board, Pace},
-        command::columns,
+        command::{Readings, columns},
         designed,
     },
 };
@@ -461,7 +461,7 @@ fn an_extended_model_reproduces_the_explanation() {
         let after = explain::predict(&plain.items[0].problem, &effects);
         let (model, extended) = prepared(folder.path(), &extended, &recording(), Purpose::Compare);
         assert_eq!(extended.items[0].problem.modelled.len(), 3);
-        let written = columns(&model, &extended);
+        let written = columns(&model, &extended, Readings::Stepped);
         let again = &written
             .iter()
             .find(|(name, _)| name == "i_meas_a")
@@ -488,7 +488,7 @@ fn steps_and_moments_by_design_hold_with_effects_too() {
     let simulated = |keys: &str, effects: &str| {
         let text = format!("schema = 1\n[sensor]\nfront_end = \"pair\"\n{keys}{effects}");
         let (model, prepared) = prepared(folder.path(), &text, &recording(), Purpose::Simulate);
-        let written = columns(&model, &prepared);
+        let written = columns(&model, &prepared, Readings::Stepped);
         let found = written.iter().find(|(name, _)| name == "i_meas_a");
         found.unwrap().1.clone()
     };
@@ -515,6 +515,25 @@ fn steps_and_moments_by_design_hold_with_effects_too() {
     }
 }
 
+/// Unrounded, readings with a step are those without one.
+#[test]
+fn a_step_can_be_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let simulated = |keys: &str, readings: Readings| {
+        let text = format!("schema = 1\n[sensor]\nfront_end = \"pair\"\n{keys}");
+        let (model, prepared) = prepared(folder.path(), &text, &recording(), Purpose::Simulate);
+        let written = columns(&model, &prepared, readings);
+        let found = written.iter().find(|(name, _)| name == "i_meas_a");
+        found.unwrap().1.clone()
+    };
+    for effects in ["", "[effects.offset]\noffset_a = 10.1\n"] {
+        let plain = simulated(effects, Readings::Stepped);
+        let stepped = format!("step = 0.5\n{effects}");
+        assert_eq!(simulated(&stepped, Readings::Unrounded), plain);
+        assert_ne!(simulated(&stepped, Readings::Stepped), plain);
+    }
+}
+
 /// What the effects of a model file add to the current, the board's meter counts.
 #[test]
 fn the_meter_counts_what_effects_add() {
@@ -522,7 +541,7 @@ fn the_meter_counts_what_effects_add() {
     let charge = |effects: &str| {
         let text = format!("schema = 1\n[sensor]\nfront_end = \"dual-range\"\n{effects}");
         let (model, prepared) = prepared(folder.path(), &text, &recording(), Purpose::Simulate);
-        let written = columns(&model, &prepared);
+        let written = columns(&model, &prepared, Readings::Stepped);
         let counted = written.iter().find(|(name, _)| name == "q_meas_c").unwrap();
         (
             *counted.1.last().unwrap(),
@@ -548,7 +567,7 @@ fn simulating_needs_nothing_but_the_drive() {
     let model = "schema = 1\n[sensor]\nfront_end = \"dual-range\"\n[battery]\ncapacity_ah = 100\ninitial_soc = 0.5\n\
                  ocv = [[0, 3.0], [1, 4.0]]\nohmic_resistance_ohm = 0.001\n";
     let (model, prepared) = prepared(folder.path(), model, &text, Purpose::Simulate);
-    let written = columns(&model, &prepared);
+    let written = columns(&model, &prepared, Readings::Stepped);
     let names: Vec<&str> = written.iter().map(|(name, _)| name.as_str()).collect();
     assert_eq!(
         names,

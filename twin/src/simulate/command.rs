@@ -44,6 +44,19 @@ pub struct Arguments {
     /// Calls a column by another name; a minus before the column turns its sign.
     #[arg(long, value_name = "NAME=COLUMN", allow_hyphen_values = true)]
     map: Vec<String>,
+    /// Leaves readings as they are before they are rounded to the model's step: compared with a recording, they are off by
+    /// one rounding and not by two.
+    #[arg(long)]
+    no_step: bool,
+}
+
+/// How readings are written whose sensor has a step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Readings {
+    /// In steps, as they are reported.
+    Stepped,
+    /// As they are before that.
+    Unrounded,
 }
 
 /// Simulates, and says in a few lines what was written.
@@ -66,7 +79,12 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     };
     let progress = Progress::new(format!("simulating {}", arguments.recording.display()));
     let prepared = prepare(&model, &inputs, Purpose::Simulate)?;
-    let columns = columns(&model, &prepared);
+    let readings = if arguments.no_step {
+        Readings::Unrounded
+    } else {
+        Readings::Stepped
+    };
+    let columns = columns(&model, &prepared, readings);
     drop(progress);
     let table = Table::new(arguments.out.display().to_string(), columns)?;
     let mut writing = Progress::new(format!("writing {}", arguments.out.display()));
@@ -90,7 +108,7 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
 }
 
 /// Time and the simulated signals, one row for each of the recording.
-pub fn columns(model: &Model, prepared: &Prepared) -> Vec<(String, Vec<f64>)> {
+pub fn columns(model: &Model, prepared: &Prepared, readings: Readings) -> Vec<(String, Vec<f64>)> {
     let rows = prepared.t_s.len();
     let mut columns = vec![("t_s".to_owned(), prepared.t_s.clone())];
     let mut add = |name: &str, from: &[usize], values: &[f64]| {
@@ -106,7 +124,7 @@ pub fn columns(model: &Model, prepared: &Prepared) -> Vec<(String, Vec<f64>)> {
     for item in &prepared.items {
         match item.problem.view {
             View::Charge => {}
-            _ => add(&item.problem.name, &item.rows, &predicted(item)),
+            _ => add(&item.problem.name, &item.rows, &predicted(item, readings)),
         }
     }
     let sensor = prepared
@@ -125,16 +143,16 @@ pub fn columns(model: &Model, prepared: &Prepared) -> Vec<(String, Vec<f64>)> {
 
 /// What the simulation says at each observed row, with the effects of the model file: the one place where they are
 /// applied.
-pub fn predicted(item: &Item) -> Vec<f64> {
+pub fn predicted(item: &Item, readings: Readings) -> Vec<f64> {
     let problem = &item.problem;
     match &problem.base {
         Base::Sensor(base) if base.reading.is_empty() => {
             let mut said = if problem.modelled.is_empty() && base.alignment_s == 0.0 {
-                super::designed(problem)
+                super::unrounded(problem, base)
             } else {
                 explain::predict(problem, &[])
             };
-            if problem.view == View::Sensor {
+            if problem.view == View::Sensor && readings == Readings::Stepped {
                 said.iter_mut()
                     .for_each(|value| *value = base.stepped(*value));
             }
@@ -174,7 +192,7 @@ fn counter(model: &Model, prepared: &Prepared) -> Option<Vec<f64>> {
     }
     let charge = model.charge.as_ref()?;
     let step = charge.step_c;
-    let counted = integral_c(problem, &predicted(item))
+    let counted = integral_c(problem, &predicted(item, Readings::Stepped))
         .into_iter()
         .map(|sum| {
             if step > 0.0 {
