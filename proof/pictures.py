@@ -118,8 +118,8 @@ def others(data: dict, folder: pathlib.Path) -> None:
 def false_alarms(data: dict, folder: pathlib.Path) -> None:
     """Clean recordings in which something is named."""
     lines = [(f"twin, {KINDS[line['kind']]}", line["named"], BLUE) for line in data["clean"]]
-    lines += [(f"{line['name']}, {line['data']}", line["false_alarms"], GREY) for line in data["methods"]
-              if line["name"] != "twin" and line["names_effects"] and line["false_alarms"]["of"]]
+    lines += [(f"{line['name']}, {KINDS[kind]}", share, GREY) for line in data["methods"]
+              if line["name"] != "twin" and line["names_effects"] for kind, share in line["false_alarms"].items()]
     lines = [line for line in lines if line[1]["of"]]
     if not lines:
         return

@@ -92,6 +92,11 @@ impl Record {
         ))
     }
 
+    /// Something was taken out of the library, and what the tool says then is not there.
+    pub fn failed_without(&self) -> bool {
+        !self.removed.is_empty() && self.without.is_none()
+    }
+
     /// How it went without the true effects in the library.
     pub fn judgement_without(&self) -> Option<Judgement> {
         let truth = self.truth.as_ref()?;
@@ -137,12 +142,47 @@ pub struct Campaign {
 }
 
 /// Hashes of what decides results.
+#[derive(PartialEq)]
 struct Sources {
     tool: String,
     makers: BTreeMap<String, String>,
     methods: String,
     expected: String,
     board: String,
+    /// Models, recordings and packages, and what of this program works on a case.
+    inputs: String,
+}
+
+/// What is worked out while a case runs, and kept; how an answer is judged is worked out anew each time.
+const OWN: [&str; 7] = [
+    include_str!("run.rs"),
+    include_str!("tool.rs"),
+    include_str!("make.rs"),
+    include_str!("program.rs"),
+    include_str!("real.rs"),
+    include_str!("board.rs"),
+    include_str!("table.rs"),
+];
+
+/// Over all files of a folder and of those in it; of none where it is not there.
+fn hash_tree(folder: &Path, all: &mut String) -> Result<()> {
+    if !folder.is_dir() {
+        return Ok(());
+    }
+    let entries = fs::read_dir(folder).with_context(|| format!("reading {}", folder.display()))?;
+    let mut paths = entries
+        .map(|entry| entry.map(|entry| entry.path()))
+        .collect::<std::io::Result<Vec<PathBuf>>>()
+        .with_context(|| format!("reading {}", folder.display()))?;
+    paths.sort();
+    for path in paths {
+        if path.is_dir() {
+            hash_tree(&path, all)?;
+        } else {
+            all.push_str(&hash_file(&path)?);
+        }
+    }
+    Ok(())
 }
 
 impl Sources {
@@ -150,6 +190,7 @@ impl Sources {
     fn key(&self, planned: &Planned) -> Result<String> {
         let mut all = serde_json::to_string(planned)?;
         all.push_str(&self.tool);
+        all.push_str(&self.inputs);
         all.push_str(match planned.group {
             Group::Real => &self.expected,
             Group::Board => &self.board,
@@ -254,6 +295,11 @@ impl Campaign {
         for record in locked(&ran).drain(..) {
             records.insert(record.planned.case.id.clone(), record);
         }
+        if self.sources(plan)? != sources {
+            bail!(
+                "the tool, the makers, the methods or expected.toml changed while the campaign ran: run it again"
+            );
+        }
         Ok(plan
             .iter()
             .filter_map(|planned| records.remove(&planned.case.id))
@@ -282,7 +328,20 @@ impl Campaign {
                 Some(board) => hash_file(&board.emulate)? + &hash_file(&board.image)?,
                 None => String::new(),
             },
+            inputs: self.inputs()?,
         })
+    }
+
+    fn inputs(&self) -> Result<String> {
+        let mut all = OWN.concat();
+        for folder in ["models", "recordings"] {
+            hash_tree(&self.root.join(folder), &mut all)?;
+        }
+        let packages = self.root.join("proof/requirements.txt");
+        if packages.exists() {
+            all.push_str(&hash_file(&packages)?);
+        }
+        Ok(hash(all.as_bytes()))
     }
 
     fn batch(
@@ -685,6 +744,15 @@ fi
             .unwrap();
         assert_eq!(runs(), 4);
         assert_ne!(other[0].key, records[0].key);
+        // So does what a recording or a model holds.
+        let models = folder.path().join("models");
+        fs::create_dir_all(&models).unwrap();
+        fs::write(models.join("car.toml"), "schema = 1\n").unwrap();
+        let with_model = campaign(folder.path(), &format!("{TOOL}# changed\n"))
+            .run(&plan())
+            .unwrap();
+        assert_eq!(runs(), 6);
+        assert_ne!(with_model[0].key, other[0].key);
         // The data were there; another maker makes others.
         let made = || lines(&folder.path().join("makers/runs"));
         assert_eq!(made(), 1);
@@ -692,7 +760,7 @@ fi
         let maker = folder.path().join("makers/make.py");
         fs::write(maker, format!("{MAKER}# changed\n")).unwrap();
         changed.run(&plan()).unwrap();
-        assert_eq!((runs(), made()), (6, 2));
+        assert_eq!((runs(), made()), (8, 2));
     }
 
     #[test]
