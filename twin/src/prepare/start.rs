@@ -19,8 +19,11 @@ const AT_REST_V: f64 = 0.010;
 const OF_READING: f64 = 0.005;
 /// No reading is worth less than this uncertainty, 0 … 1: where the open-circuit voltage is flat it tells nothing.
 const WORTH: f64 = 0.3;
-/// A tester's counter is believed over a gap if it has followed the current within this share of the capacity before.
+/// A tester's counter is believed over a gap if it has followed the current within this share of the capacity before, over more than that.
 const COUNTER_SHARE: f64 = 0.02;
+/// Readings on both sides of a gap may say something else than a counter does by this share of its charge: a worn cell has lost as much of
+/// its capacity.
+const WORN: f64 = 0.3;
 /// A gap that leaves less than this of the state of charge open, 0 … 1, leaves nothing open: where a voltage is as steep as 1 V from full to
 /// empty it is a tenth of a millivolt.
 const OPEN: f64 = 1e-4;
@@ -60,6 +63,8 @@ pub(super) fn find(
     let mut end = 1.0;
     let mut bridged = 0;
     let mut open: Vec<f64> = Vec::new();
+    // Whether the counter followed the current when that last told.
+    let mut followed = false;
     for (index, own) in drive.segments.iter().enumerate() {
         let mut excess_ah = 0.0;
         let mut gap_sigma = 0.0;
@@ -68,14 +73,19 @@ pub(super) fn find(
             // The counter is beside the current as it was recorded; through the battery flows what is left of that without its zero.
             let recorded_a = [drive.reference[own.start - 1], drive.reference[own.start]];
             let ends_a = recorded_a.map(|end_a| end_a - base.current_zero_a);
-            let before = &drive.segments[index - 1];
-            let counted = readings
-                .counter_ah
-                .and_then(|ah| over_gap(ah, drive, before.clone(), own.start, battery.capacity_ah));
             let left_ah = |excess_ah| gap_ah(ends_a, gap_s, excess_ah, battery.efficiency);
             let line = end - left_ah(0.0) / battery.capacity_ah;
+            let line_ah = gap_ah(recorded_a, gap_s, 0.0, 1.0);
+            let counted = readings
+                .counter_ah
+                .filter(|_| followed)
+                .and_then(|ah| over_gap(ah, own.start, line_ah, battery.capacity_ah))
+                .filter(|counted_ah| {
+                    let lost = left_ah(counted_ah - line_ah) / battery.capacity_ah;
+                    contradicted(base, readings, index, -lost) <= WORN * lost.abs()
+                });
             match counted {
-                Some(ah) => excess_ah = ah - gap_ah(recorded_a, gap_s, 0.0, 1.0),
+                Some(counted_ah) => excess_ah = counted_ah - line_ah,
                 None => {
                     let sigma = gap_s * line_sigma_a(drive, index) / 3600.0 / battery.capacity_ah;
                     let sigma = sigma.max(contradicted(base, readings, index, line - end));
@@ -101,8 +111,13 @@ pub(super) fn find(
         } else {
             let (first, sigma) = begun(work, base, readings, battery, index);
             base.initial_soc_sigma.push(sigma);
+            followed = false;
             first
         };
+        let told = readings
+            .counter_ah
+            .and_then(|ah| follows(ah, drive, own.clone(), battery.capacity_ah));
+        followed = told.unwrap_or(followed);
         base.initial_soc.push(first);
         base.gap_excess_ah.push(excess_ah);
         base.gap_soc_sigma.push(gap_sigma);
@@ -238,20 +253,33 @@ fn charge_ah(drive: &Drive, rows: Range<usize>, zero_a: f64, efficiency: f64) ->
     charge / 3600.0
 }
 
-/// What a tester's counter says of a gap, if it followed the current before.
-fn over_gap(
-    ah: &[f64],
-    drive: &Drive,
-    before: Range<usize>,
-    after: usize,
-    capacity_ah: f64,
-) -> Option<f64> {
-    let last = before.end - 1;
-    let counted = ah[last] - ah[before.start];
-    let flowed = charge_ah(drive, before, 0.0, 1.0);
-    let over = ah[after] - ah[last];
-    let follows = (counted - flowed).abs() <= COUNTER_SHARE * capacity_ah;
-    (follows && over.is_finite() && over.abs() <= capacity_ah).then_some(over)
+/// Whether a tester's counter follows the current over a segment; `None` where so little flows that one which stands would, too.
+fn follows(ah: &[f64], drive: &Drive, rows: Range<usize>, capacity_ah: f64) -> Option<bool> {
+    let within_ah = COUNTER_SHARE * capacity_ah;
+    let is_near = |(flowed_ah, row): (f64, usize)| {
+        (ah[row] - ah[rows.start] - flowed_ah).abs() <= within_ah
+    };
+    // Of what flows to and fro, where it is farthest from the start.
+    let mut flowed_ah = 0.0_f64;
+    let (mut last, mut farthest) = ((0.0, rows.start), (0.0_f64, rows.start));
+    for row in rows.start + 1..rows.end {
+        flowed_ah += charge_ah(drive, row - 1..row + 1, 0.0, 1.0);
+        last = (flowed_ah, row);
+        if flowed_ah.abs() > farthest.0.abs() && ah[row].is_finite() {
+            farthest = last;
+        }
+    }
+    let follows = is_near(last) && is_near(farthest);
+    (!follows || farthest.0.abs() > within_ah).then_some(follows)
+}
+
+/// What a tester's counter says of the gap before a row, in Ah, unless it was set anew there: by itself it then says what a straight line
+/// does, `line_ah`, and the difference does not.
+fn over_gap(ah: &[f64], after: usize, line_ah: f64, capacity_ah: f64) -> Option<f64> {
+    let over_ah = ah[after] - ah[after - 1];
+    let as_the_line = |ah: f64| (ah - line_ah).abs() <= COUNTER_SHARE * capacity_ah;
+    let is_reset = as_the_line(ah[after]) && !as_the_line(over_ah);
+    (!is_reset && over_ah.abs() <= capacity_ah).then_some(over_ah)
 }
 
 /// How far the mean current over the gap before a segment may be from that of a straight line between its ends, in A, as a standard
