@@ -276,6 +276,37 @@ fn the_proposed_mapping_is_taken() {
     assert_eq!(output.status.code(), Some(0), "{output:?}");
 }
 
+#[test]
+fn a_sign_is_turned_of_the_column_that_the_file_has() {
+    for (map, cure) in [
+        ("i_meas_a=Sensor.I", "--map i_meas_a=-Sensor.I"),
+        ("i_meas_a=-Sensor.I", "--map i_meas_a=Sensor.I"),
+    ] {
+        let sign = if map.contains('-') { 1.0 } else { -1.0 };
+        let sensor = "t_s,i_ref_a,Sensor.I\n".to_owned()
+            + &rows(300, |t| format!("{t},{},{}", current(t), sign * current(t)));
+        let sentence = refused(
+            &[("m.toml", PAIR), ("r.csv", &sensor)],
+            &explain_with(&["--map", map]),
+        );
+        assert!(sentence.trim_end().ends_with(cure), "{sentence}");
+    }
+    let counter = counted(-1.0).replace("q_meas_c", "Board.Charge");
+    let sentence = refused(
+        &[("m.toml", COUNTED), ("r.csv", &counter)],
+        &explain_with(&["--map", "q_meas_c=Board.Charge"]),
+    );
+    says(&sentence, &["--map q_meas_c=-Board.Charge"]);
+    // The current of a battery, named in the model file.
+    let battery = "schema = 1\n[columns]\ni_ref_a = \"Shunt\"\n[battery]\ncapacity_ah = 2\nocv = [[0, 3.0], [1, 4.0]]\n\
+                   ohmic_resistance_ohm = 0.1\n";
+    let recording = "t_s,Shunt,v_cell_v\n".to_owned()
+        + &rows(300, |t| {
+            format!("{t},{},{}", current(t), 3.7 + 0.1 * current(t))
+        });
+    says(&explained(battery, &recording), &["--map i_ref_a=-Shunt"]);
+}
+
 /// A file that was never fitted shows what was fitted, or nothing.
 #[test]
 fn a_hold_out_without_what_is_fitted() {

@@ -119,8 +119,8 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             },
         };
         if work.purpose.compares() {
-            let source = work.frame.source();
-            checks::battery(view, &drive, &observed, &base, [source, name, &current])?;
+            let frames = [work.frame, work.drive_frame()];
+            checks::battery(view, &drive, &observed, &base, frames, [name, &current])?;
         }
         let (noise, coloured, accuracy) = match view {
             View::StateOfCharge => (battery.noise_pct, Coloured::default(), battery.accuracy_pct),

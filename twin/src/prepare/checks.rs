@@ -403,9 +403,10 @@ pub(super) fn pair(
     drive: &Drive,
     observed: &Observed,
     wild: &Wild,
-    source: &str,
+    frame: &Frame,
     [reference, measured]: [&str; 2],
 ) -> Result<(), Failure> {
+    let source = frame.source();
     let pairs = beside(drive, observed, &wild.rows);
     if pairs.clone().count() < FEWEST_ROWS {
         return Ok(());
@@ -436,7 +437,8 @@ pub(super) fn pair(
     if together < OPPOSITE {
         return Err(Failure::Input(format!(
             "{source}: {measured} falls where {reference} rises (correlation {together:.2}): found opposite signs, expected \
-             discharge positive in both; to turn one: --map {measured}=-{measured}"
+             discharge positive in both; to turn one: --map {}",
+            frame.turned(measured)
         )));
     }
     Ok(())
@@ -452,9 +454,10 @@ pub(super) fn counter(
     drive: &Drive,
     readings: &Observed,
     interval_s: f64,
-    source: &str,
+    frame: &Frame,
     column: &str,
 ) -> Result<(), Failure> {
+    let source = frame.source();
     let charge_c = integral(&drive.t_s, &drive.segments, &drive.reference, false);
     let charge = Drive {
         reference: charge_c.into(),
@@ -519,7 +522,8 @@ pub(super) fn counter(
     if together < 0.0 {
         return Err(Failure::Input(format!(
             "{source}: {column} falls where the reference's charge rises (correlation {together:.2}): found opposite signs, \
-             expected discharge positive in both; to turn one: --map {column}=-{column}"
+             expected discharge positive in both; to turn one: --map {}",
+            frame.turned(column)
         )));
     }
     Ok(())
@@ -705,8 +709,10 @@ pub(super) fn battery(
     drive: &Drive,
     observed: &Observed,
     base: &BatteryBase,
-    [source, name, current]: [&str; 3],
+    [frame, of_current]: [&Frame; 2],
+    [name, current]: [&str; 2],
 ) -> Result<(), Failure> {
+    let source = frame.source();
     let pairs = beside(drive, observed, &[]);
     if pairs.clone().count() < FEWEST_ROWS {
         return Ok(());
@@ -770,7 +776,8 @@ pub(super) fn battery(
     if together > -OPPOSITE {
         return Err(Failure::Input(format!(
             "{source}: {name} rises where {current} rises (correlation {together:.2}): found charging positive, expected discharge \
-             positive; to turn it: --map {current}=-{current}"
+             positive; to turn it: --map {}",
+            of_current.turned(current)
         )));
     }
     Ok(())
