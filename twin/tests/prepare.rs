@@ -284,6 +284,25 @@ fn rows_of_their_own_are_not_interpolated() {
 }
 
 #[test]
+fn a_dead_sensor_is_not_in_another_unit() {
+    let folder = tempfile::tempdir().unwrap();
+    let rows = (0..400).map(|k| {
+        let t = f64::from(k) * 0.1;
+        let noise = 0.05 * (12.9898 * f64::from(k * k % 977)).sin();
+        vec![t, 4.0 * current(t), noise]
+    });
+    let recording = text("t_s,i_ref_a,i_meas_a", rows);
+    let prepared = read(folder.path(), PAIR, &recording, &[]).unwrap();
+    let remarks = prepared.remarks;
+    assert!(
+        remarks
+            .iter()
+            .any(|remark| remark.contains("the sensor may be dead")),
+        "{remarks:?}"
+    );
+}
+
+#[test]
 fn a_minus_turns_the_sign() {
     let folder = tempfile::tempdir().unwrap();
     let rows = (0..200).map(|k| {

@@ -16,6 +16,8 @@ use crate::{
 const POWER_WITHIN: f64 = 2.0;
 /// Below this correlation with its reference a sensor counts the other way round.
 const OPPOSITE: f64 = -0.5;
+/// Above this correlation, or below its opposite, a factor between the two is one of units: noise moves by any factor less.
+const RELATED: f64 = 0.5;
 /// Of one and the same current it is below this.
 const SURELY_OPPOSITE: f64 = -0.8;
 /// Below this magnitude of correlation the two have nothing in common.
@@ -413,7 +415,10 @@ pub(super) fn pair(
     }
     let spread_x = spread(pairs.clone().map(|(reference, _)| reference));
     let spread_y = spread(pairs.clone().map(|(_, reading)| reading));
-    if let Some(power) = thousands(spread_x / spread_y) {
+    let together = correlation(pairs);
+    if together.abs() > RELATED
+        && let Some(power) = thousands(spread_x / spread_y)
+    {
         let (large, small) = if power > 0 {
             (reference, measured)
         } else {
@@ -427,7 +432,6 @@ pub(super) fn pair(
             spread_x.min(spread_y)
         )));
     }
-    let together = correlation(pairs);
     if (SURELY_OPPOSITE..OPPOSITE).contains(&together) {
         return Err(Failure::Input(format!(
             "{source}: {measured} falls where {reference} rises, but only loosely (correlation {together:.2}): found two signals \
