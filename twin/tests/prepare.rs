@@ -284,6 +284,36 @@ fn rows_of_their_own_are_not_interpolated() {
 }
 
 #[test]
+fn a_held_value_counts_once_on_rows_of_its_own() {
+    // As a bus delivers them: measured each 0.1 s, sent each 0.02 s, the reference between.
+    let rows = (0..2000).map(|k| {
+        let t = f64::from(k) * 0.01;
+        if k % 2 == 0 {
+            vec![t, current(t), f64::NAN]
+        } else {
+            vec![t, f64::NAN, current(f64::from(k / 10) * 0.1)]
+        }
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    assert!(!problem.observed.on_drive_rows());
+    let fresh = problem.observed.valid_rows();
+    assert!((198..=202).contains(&fresh), "{fresh}");
+    assert!(remarks[0].contains("100.000 ms"), "{remarks:?}");
+    // A reference that comes each second does not jump there: readings in steps between two of its rows are new.
+    let rows = (0..2000).map(|k| {
+        let t = f64::from(k) * 0.1;
+        if k % 10 == 0 {
+            vec![t, current(0.1 * t), f64::NAN]
+        } else {
+            vec![t, f64::NAN, (current(0.1 * t) / 0.4).round() * 0.4]
+        }
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    let fresh = problem.observed.valid_rows();
+    assert!(fresh > 1780, "{fresh} {remarks:?}");
+}
+
+#[test]
 fn a_dead_sensor_is_not_in_another_unit() {
     let folder = tempfile::tempdir().unwrap();
     let rows = (0..400).map(|k| {
