@@ -701,6 +701,30 @@ fn a_counter_is_believed_over_a_gap_unless_something_speaks_against_it() {
 }
 
 #[test]
+fn a_stated_start_is_that_of_the_first_operation() {
+    let operation = |cycle: f64| {
+        let rows = cell(&[(300, 0.5), (300, 1.0)]).into_iter();
+        rows.map(move |row| vec![row[0], cycle, row[1], row[2]])
+    };
+    let recording = text(
+        "t_s,cycle,i_ref_a,v_cell_v",
+        operation(0.0).chain(operation(1.0)),
+    );
+    let (problem, remarks) = one(&format!("{BATTERY}initial_soc = 0.9\n"), &recording);
+    assert_eq!(battery_of(&problem).initial_soc[0], 0.9);
+    let said = "initial_soc is said of the first operation: 90.0 % ± ";
+    let of_second = |remark: &&String| {
+        remark.starts_with(said)
+            && remark.ends_with("from the first reading of v_cell_v of operation 2")
+    };
+    assert_eq!(remarks.iter().filter(of_second).count(), 1, "{remarks:?}");
+    let not_stated = |remark: &String| remark.contains("not stated");
+    assert!(!remarks.iter().any(not_stated), "{remarks:?}");
+    let (_, remarks) = one(BATTERY, &recording);
+    assert!(remarks.iter().any(not_stated), "{remarks:?}");
+}
+
+#[test]
 fn a_zero_that_follows_the_supply_needs_the_full_scale() {
     let rows = (0..200).map(|k| {
         let t = f64::from(k);

@@ -194,6 +194,14 @@ fn begun(
         seen(base, readings, index)
     };
     let told = |(soc, sigma): Soc| format!("{:.1} % ± {:.1} %", 100.0 * soc, 100.0 * sigma);
+    // Stated, it is so of the first operation alone.
+    let of_other = battery
+        .initial_soc
+        .map(|_| format!("of operation {}", readings.clocks[index] + 1));
+    let not_stated = match &of_other {
+        Some(_) => "initial_soc is said of the first operation",
+        None => "initial_soc is not stated",
+    };
     match (stated, seen) {
         (Some(stated), None) => stated,
         // What is stated is said of the fitted recording: another one may begin there too, but need not.
@@ -211,19 +219,21 @@ fn begun(
         }
         (None, Some(seen)) => {
             work.remark(format!(
-                "initial_soc is not stated: {} taken from the first reading of {name}{}",
+                "{not_stated}: {} taken from the first reading of {name}{}",
                 told(seen),
-                if index == 0 {
-                    String::new()
-                } else {
-                    format!(" of stretch {}", index + 1)
+                match of_other {
+                    Some(of_other) => format!(" {of_other}"),
+                    None if index == 0 => String::new(),
+                    None => format!(" of stretch {}", index + 1),
                 }
             ));
             (seen.0, sigma.max(seen.1))
         }
         (None, None) => {
+            let that =
+                of_other.map_or_else(|| "it".to_owned(), |of_other| format!("that {of_other}"));
             work.remark(format!(
-                "initial_soc is not stated and {name} does not tell it: a full battery is assumed"
+                "{not_stated} and {name} does not tell {that}: a full battery is assumed"
             ));
             (1.0, 1.0)
         }
@@ -256,9 +266,8 @@ fn charge_ah(drive: &Drive, rows: Range<usize>, zero_a: f64, efficiency: f64) ->
 /// Whether a tester's counter follows the current over a segment; `None` where so little flows that one which stands would, too.
 fn follows(ah: &[f64], drive: &Drive, rows: Range<usize>, capacity_ah: f64) -> Option<bool> {
     let within_ah = COUNTER_SHARE * capacity_ah;
-    let is_near = |(flowed_ah, row): (f64, usize)| {
-        (ah[row] - ah[rows.start] - flowed_ah).abs() <= within_ah
-    };
+    let is_near =
+        |(flowed_ah, row): (f64, usize)| (ah[row] - ah[rows.start] - flowed_ah).abs() <= within_ah;
     // Of what flows to and fro, where it is farthest from the start.
     let mut flowed_ah = 0.0_f64;
     let (mut last, mut farthest) = ((0.0, rows.start), (0.0_f64, rows.start));
