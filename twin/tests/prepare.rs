@@ -725,6 +725,21 @@ fn a_stated_start_is_that_of_the_first_operation() {
 }
 
 #[test]
+fn what_goes_by_the_resistance_needs_one() {
+    let recording = text(
+        "t_s,i_ref_a,v_cell_v",
+        cell(&[(300, 0.5), (300, 1.0)]).into_iter(),
+    );
+    let lacks = |model: &str| {
+        let (_, remarks) = one(model, &recording);
+        let says = |remark: &String| remark.contains("no ohmic_resistance_ohm: resistance");
+        remarks.iter().any(says)
+    };
+    assert!(!lacks(BATTERY));
+    assert!(lacks(&BATTERY.replace("ohmic_resistance_ohm = 0.01\n", "")));
+}
+
+#[test]
 fn a_zero_that_follows_the_supply_needs_the_full_scale() {
     let rows = (0..200).map(|k| {
         let t = f64::from(k);

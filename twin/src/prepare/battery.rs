@@ -67,6 +67,17 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
     let parts = series::drive(work.drive_frame(), found);
     let mut drive = parts.drive;
     work.surroundings(&mut drive, &parts.rows);
+    let is_voltage = |(view, _): &(View, &str)| *view == View::Voltage;
+    if work.purpose == Purpose::Compare
+        && battery.resistance_ohm == 0.0
+        && views.iter().any(is_voltage)
+    {
+        work.remark(
+            "[battery] has no ohmic_resistance_ohm: resistance, charge-transfer, polarisation and diffusion, whose sizes go by it, are not \
+             looked for"
+                .to_owned(),
+        );
+    }
     let counter_ah = work.drive_frame().column(COUNTER);
     let counter_ah: Option<Vec<f64>> =
         counter_ah.map(|ah| parts.rows.iter().map(|row| ah[*row]).collect());
