@@ -421,6 +421,12 @@ fn decide(
             left,
             unavoidable,
         );
+        // With the names taken back, all that they took is left again.
+        let left = if selection.named.is_empty() {
+            before
+        } else {
+            left
+        };
         let held = folds(bench, &selection.fit);
         let not_there = not_there(bench, &selection, others);
         let found = doubt(

@@ -147,10 +147,12 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
                 arguments.recording.display()
             )));
         }
+        let lacking = lacking(&prepared, &other, file, &arguments.recording)?;
         remarks.extend(
             other
                 .remarks
                 .iter()
+                .chain(&lacking)
                 .map(|remark| format!("{}: {remark}", file.display())),
         );
         holdouts.push(Holdout {
@@ -209,6 +211,40 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
         ));
     }
     Ok(said)
+}
+
+/// What a hold-out lacks of what is fitted; an error if that is all of it.
+fn lacking(
+    fitted: &Prepared,
+    other: &Prepared,
+    file: &Path,
+    recording: &Path,
+) -> Result<Option<String>, Failure> {
+    let names = |prepared: &Prepared| -> Vec<String> {
+        let items = prepared.items.iter();
+        items.map(|item| item.problem.name.clone()).collect()
+    };
+    let (fits, has) = (names(fitted), names(other));
+    let lacks: Vec<&str> = fits
+        .iter()
+        .filter(|name| !has.contains(name))
+        .map(String::as_str)
+        .collect();
+    if lacks.len() == fits.len() {
+        return Err(Failure::Input(format!(
+            "{}: found {} to compare, expected the column {}, which is fitted in {}: a hold-out shows what is fitted",
+            file.display(),
+            has.join(" and "),
+            fits.join(" or "),
+            recording.display()
+        )));
+    }
+    Ok((!lacks.is_empty()).then(|| {
+        format!(
+            "{} is not compared there: what is found in it is not asked of this file",
+            lacks.join(" and ")
+        )
+    }))
 }
 
 /// The problems with as many readings as fits look at: the memory of the others is free.

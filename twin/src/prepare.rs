@@ -406,7 +406,7 @@ impl<'a> Work<'a> {
             let wild = checks::wild(&drive, &observed);
             let names = [reference.as_str(), measured.as_str()];
             let (errors, remarks) = (
-                checks::pair(&drive, &observed, &wild, self.frame.source(), names),
+                checks::pair(&drive, &observed, &wild, self.frame, names),
                 checks::plausible(&drive, &observed, &wild, sensor, names),
             );
             for remark in remarks {

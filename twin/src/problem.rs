@@ -601,6 +601,18 @@ impl Observed {
         }
     }
 
+    /// The drive's row at which a reading was taken, or the last before it.
+    pub fn drive_row_before(&self, drive: &Drive, row: usize) -> Option<usize> {
+        self.drive_row(row).or_else(|| {
+            let range = drive.segments.get(self.segment_of(row))?;
+            let times = &drive.t_s[range.clone()];
+            let at = times
+                .partition_point(|t| *t <= self.t_s[row])
+                .saturating_sub(1);
+            (range.start + at < range.end).then_some(range.start + at)
+        })
+    }
+
     /// Rows that count.
     pub fn valid_rows(&self) -> usize {
         self.valid.iter().filter(|valid| **valid).count()

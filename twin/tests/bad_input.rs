@@ -277,6 +277,93 @@ fn the_proposed_mapping_is_taken() {
 }
 
 #[test]
+fn a_sign_is_turned_of_the_column_that_the_file_has() {
+    for (map, cure) in [
+        ("i_meas_a=Sensor.I", "--map i_meas_a=-Sensor.I"),
+        ("i_meas_a=-Sensor.I", "--map i_meas_a=Sensor.I"),
+    ] {
+        let sign = if map.contains('-') { 1.0 } else { -1.0 };
+        let sensor = "t_s,i_ref_a,Sensor.I\n".to_owned()
+            + &rows(300, |t| format!("{t},{},{}", current(t), sign * current(t)));
+        let sentence = refused(
+            &[("m.toml", PAIR), ("r.csv", &sensor)],
+            &explain_with(&["--map", map]),
+        );
+        assert!(sentence.trim_end().ends_with(cure), "{sentence}");
+    }
+    let counter = counted(-1.0).replace("q_meas_c", "Board.Charge");
+    let sentence = refused(
+        &[("m.toml", COUNTED), ("r.csv", &counter)],
+        &explain_with(&["--map", "q_meas_c=Board.Charge"]),
+    );
+    says(&sentence, &["--map q_meas_c=-Board.Charge"]);
+    // The current of a battery, named in the model file.
+    let battery = "schema = 1\n[columns]\ni_ref_a = \"Shunt\"\n[battery]\ncapacity_ah = 2\nocv = [[0, 3.0], [1, 4.0]]\n\
+                   ohmic_resistance_ohm = 0.1\n";
+    let recording = "t_s,Shunt,v_cell_v\n".to_owned()
+        + &rows(300, |t| {
+            format!("{t},{},{}", current(t), 3.7 + 0.1 * current(t))
+        });
+    says(&explained(battery, &recording), &["--map i_ref_a=-Shunt"]);
+}
+
+/// A file that was never fitted shows what was fitted, or nothing.
+#[test]
+fn a_hold_out_without_what_is_fitted() {
+    let battery = "schema = 1\n[sensor]\n[battery]\ncapacity_ah = 2\ncells = 4\nocv = [[0, 3.0], [1, 4.0]]\nohmic_resistance_ohm = 0.01\n";
+    let recording = |name: &str, cells: f64, seed: f64| {
+        format!("t_s,i_ref_a,{name}\n")
+            + &rows(300, |t| {
+                let noise = 0.001 * (seed + 7919.0 * t * t).sin();
+                format!(
+                    "{t},{},{}",
+                    current(t),
+                    cells * (3.7 - 0.01 * current(t) + noise)
+                )
+            })
+    };
+    let files = [
+        ("m.toml", battery),
+        ("r.csv", &recording("v_cell_v", 1.0, 0.0)),
+        ("other.csv", &recording("v_pack_v", 4.0, 1.0)),
+    ];
+    says(
+        &refused(&files, &explain_with(&["--holdout", "other.csv"])),
+        &[
+            "other.csv: found v_pack_v to compare",
+            "expected the column v_cell_v",
+            "fitted in r.csv",
+        ],
+    );
+    // Something of it is there: that is shown, and what is not is said.
+    let both = |seed: f64, more: bool| {
+        let header = if more {
+            "t_s,i_ref_a,i_meas_a,v_cell_v\n"
+        } else {
+            "t_s,i_ref_a,i_meas_a,v_pack_v\n"
+        };
+        let cells = if more { 1.0 } else { 4.0 };
+        header.to_owned()
+            + &rows(300, |t| {
+                let noise = 0.001 * (seed + 7919.0 * t * t).sin();
+                let volts = cells * (3.7 - 0.01 * current(t) + noise);
+                format!("{t},{},{},{volts}", current(t), current(t) + 0.5 + noise)
+            })
+    };
+    let files = [
+        ("m.toml", battery),
+        ("r.csv", &both(0.0, true)),
+        ("other.csv", &both(1.0, false)),
+    ];
+    let said = report(&files, &["--holdout", "other.csv"]);
+    says(
+        &said["remarks"].to_string(),
+        &["other.csv: v_cell_v is not compared there"],
+    );
+    assert_eq!(said["holdouts"][0]["signal"], "i_meas_a");
+}
+
+#[test]
 fn a_reference_of_another_time() {
     // In one file: the reference ends before the sensor begins.
     let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()

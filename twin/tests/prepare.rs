@@ -10,7 +10,7 @@ use twin::{
     failure::Failure,
     model::Model,
     prepare::{Inputs, Prepared, Purpose, prepare},
-    problem::{Base, Problem, View},
+    problem::{Base, BatteryBase, Problem, View},
 };
 
 const PAIR: &str = "schema = 1\n[sensor]\n";
@@ -284,6 +284,55 @@ fn rows_of_their_own_are_not_interpolated() {
 }
 
 #[test]
+fn a_held_value_counts_once_on_rows_of_its_own() {
+    // As a bus delivers them: measured each 0.1 s, sent each 0.02 s, the reference between.
+    let rows = (0..2000).map(|k| {
+        let t = f64::from(k) * 0.01;
+        if k % 2 == 0 {
+            vec![t, current(t), f64::NAN]
+        } else {
+            vec![t, f64::NAN, current(f64::from(k / 10) * 0.1)]
+        }
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    assert!(!problem.observed.on_drive_rows());
+    let fresh = problem.observed.valid_rows();
+    assert!((198..=202).contains(&fresh), "{fresh}");
+    assert!(remarks[0].contains("100.000 ms"), "{remarks:?}");
+    // A reference that comes each second does not jump there: readings in steps between two of its rows are new.
+    let rows = (0..2000).map(|k| {
+        let t = f64::from(k) * 0.1;
+        if k % 10 == 0 {
+            vec![t, current(0.1 * t), f64::NAN]
+        } else {
+            vec![t, f64::NAN, (current(0.1 * t) / 0.4).round() * 0.4]
+        }
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    let fresh = problem.observed.valid_rows();
+    assert!(fresh > 1780, "{fresh} {remarks:?}");
+}
+
+#[test]
+fn a_dead_sensor_is_not_in_another_unit() {
+    let folder = tempfile::tempdir().unwrap();
+    let rows = (0..400).map(|k| {
+        let t = f64::from(k) * 0.1;
+        let noise = 0.05 * (12.9898 * f64::from(k * k % 977)).sin();
+        vec![t, 4.0 * current(t), noise]
+    });
+    let recording = text("t_s,i_ref_a,i_meas_a", rows);
+    let prepared = read(folder.path(), PAIR, &recording, &[]).unwrap();
+    let remarks = prepared.remarks;
+    assert!(
+        remarks
+            .iter()
+            .any(|remark| remark.contains("the sensor may be dead")),
+        "{remarks:?}"
+    );
+}
+
+#[test]
 fn a_minus_turns_the_sign() {
     let folder = tempfile::tempdir().unwrap();
     let rows = (0..200).map(|k| {
@@ -520,6 +569,174 @@ fn the_state_of_charge_goes_on_over_a_gap() {
             .any(|remark| remark.contains("straight line")),
         "{remarks:?}"
     );
+}
+
+/// A cell of `BATTERY` from 90 % on, through currents in A for so many seconds each: time, current and voltage of each second.
+fn cell(steps: &[(usize, f64)]) -> Vec<Vec<f64>> {
+    let each = steps.iter();
+    let currents: Vec<f64> = each
+        .flat_map(|(length_s, current_a)| vec![*current_a; *length_s])
+        .collect();
+    let mut soc = 0.9;
+    let mut before_a = currents[0];
+    let rows = currents.iter().enumerate();
+    rows.map(|(k, current_a)| {
+        if k > 0 {
+            soc -= 0.5 * (before_a + current_a) / 3600.0;
+        }
+        before_a = *current_a;
+        vec![k as f64, *current_a, 3.0 + soc - 0.01 * current_a]
+    })
+    .collect()
+}
+
+fn battery_of(problem: &Problem) -> &BatteryBase {
+    match &problem.base {
+        Base::Battery(base) => base,
+        Base::Sensor(_) => panic!("{problem:?}"),
+    }
+}
+
+#[test]
+fn what_flowed_before_the_first_reading_is_not_lost() {
+    let is_read = |row: &[f64]| row[0] >= 700.0;
+    let rows = cell(&[(600, 1.0), (1200, 0.5)]);
+    // On the current's rows, on rows of their own, and beside a current that reads 0.1 A too much.
+    let shared = rows.iter().map(|row| {
+        let volts = if is_read(row) { row[2] } else { f64::NAN };
+        vec![row[0], row[1], volts]
+    });
+    let own = rows.iter().flat_map(|row| {
+        let current = vec![row[0], row[1], f64::NAN];
+        let volts = is_read(row).then(|| vec![row[0] + 0.25, f64::NAN, row[2]]);
+        std::iter::once(current).chain(volts)
+    });
+    let off = shared.clone().map(|row| vec![row[0], row[1] + 0.1, row[2]]);
+    let header = "t_s,i_ref_a,v_cell_v";
+    let zero = format!("{BATTERY}current_zero_a = 0.1\n");
+    for (model, recording) in [
+        (BATTERY, text(header, shared.clone())),
+        (BATTERY, text(header, own)),
+        (&zero, text(header, off)),
+    ] {
+        let (problem, remarks) = one(model, &recording);
+        let base = battery_of(&problem);
+        assert!(
+            (base.initial_soc[0] - 0.9).abs() < 1e-6,
+            "{:?} {remarks:?}",
+            base.initial_soc
+        );
+    }
+}
+
+#[test]
+fn what_flowed_after_the_last_reading_is_no_contradiction() {
+    // 1 A throughout, no row for 100 s, and voltages until ten minutes before that.
+    let rows = cell(&[(1900, 1.0)]).into_iter();
+    let rows = rows
+        .filter(|row| !(1200.0..1300.0).contains(&row[0]))
+        .map(|row| {
+            let is_read = row[0] < 600.0 || row[0] >= 1300.0;
+            vec![row[0], row[1], if is_read { row[2] } else { f64::NAN }]
+        });
+    let (problem, _) = one(BATTERY, &text("t_s,i_ref_a,v_cell_v", rows));
+    let base = battery_of(&problem);
+    assert_eq!(base.gap_soc_sigma, [0.0, 0.0]);
+    assert!((base.initial_soc[1] - (0.9 - 1300.0 / 3600.0)).abs() < 1e-6);
+}
+
+/// What is taken of a gap of 3000 s from 600 s on, in which a current in A flows: what it leaves open, the state of charge after it, and
+/// what that truly is. `counter` is what is read at a time in s of the Ah that have flowed.
+fn over_a_gap(
+    model: &str,
+    [before_a, in_gap_a]: [f64; 2],
+    counter: impl Fn(f64, f64) -> f64,
+) -> (f64, f64, f64) {
+    // The current rests on both sides of it.
+    let steps = [
+        (560, before_a),
+        (40, 0.0),
+        (3000, in_gap_a),
+        (40, 0.0),
+        (560, 0.5),
+    ];
+    let rows = cell(&steps);
+    let flowed_ah = |row: &[f64]| 0.9 - (row[2] + 0.01 * row[1] - 3.0);
+    let truth = 0.9 - flowed_ah(&rows[3600]);
+    let rows = rows
+        .iter()
+        .filter(|row| !(600.0..3600.0).contains(&row[0]))
+        .map(|row| {
+            let ah = counter(row[0], flowed_ah(row));
+            vec![row[0], row[1], row[2], ah]
+        });
+    let (problem, _) = one(model, &text("t_s,i_ref_a,v_cell_v,ah_meas_ah", rows));
+    let base = battery_of(&problem);
+    (base.gap_soc_sigma[1], base.initial_soc[1], truth)
+}
+
+#[test]
+fn a_counter_is_believed_over_a_gap_unless_something_speaks_against_it() {
+    let (open, after, truth) = over_a_gap(BATTERY, [0.5, 0.1], |_, ah| ah);
+    assert_eq!(open, 0.0);
+    assert!((after - truth).abs() < 1e-4, "{after} {truth}");
+    // The charge that it counted is right, though the cell has lost a fifth of its capacity: that is for physics to tell.
+    let new = BATTERY.replace("capacity_ah = 1\n", "capacity_ah = 1.25\n");
+    let (open, ..) = over_a_gap(&new, [0.5, 0.48], |_, ah| ah);
+    assert_eq!(open, 0.0);
+    // Set anew in a rest, or in the middle of what flows; and one that stands, where nothing flowed that would tell so.
+    let total_ah = 0.5 * 559.5 / 3600.0;
+    let in_rest = over_a_gap(BATTERY, [0.5, 0.0], |t_s, ah| {
+        if t_s < 600.0 { ah } else { ah - total_ah }
+    });
+    let half_way = over_a_gap(BATTERY, [0.5, 0.1], |t_s, ah| {
+        let then_ah = total_ah + 0.1 * 1500.0 / 3600.0;
+        if t_s < 600.0 { ah } else { ah - then_ah }
+    });
+    let stands = over_a_gap(BATTERY, [0.0, 0.1], |_, _| 0.0);
+    for (open, after, truth) in [in_rest, half_way, stands] {
+        assert!(open > 0.0);
+        assert!((after - truth).abs() < 3e-3, "{after} {truth}");
+    }
+}
+
+#[test]
+fn a_stated_start_is_that_of_the_first_operation() {
+    let operation = |cycle: f64| {
+        let rows = cell(&[(300, 0.5), (300, 1.0)]).into_iter();
+        rows.map(move |row| vec![row[0], cycle, row[1], row[2]])
+    };
+    let recording = text(
+        "t_s,cycle,i_ref_a,v_cell_v",
+        operation(0.0).chain(operation(1.0)),
+    );
+    let (problem, remarks) = one(&format!("{BATTERY}initial_soc = 0.9\n"), &recording);
+    assert_eq!(battery_of(&problem).initial_soc[0], 0.9);
+    let said = "initial_soc is said of the first operation: 90.0 % ± ";
+    let of_second = |remark: &&String| {
+        remark.starts_with(said)
+            && remark.ends_with("from the first reading of v_cell_v of operation 2")
+    };
+    assert_eq!(remarks.iter().filter(of_second).count(), 1, "{remarks:?}");
+    let not_stated = |remark: &String| remark.contains("not stated");
+    assert!(!remarks.iter().any(not_stated), "{remarks:?}");
+    let (_, remarks) = one(BATTERY, &recording);
+    assert!(remarks.iter().any(not_stated), "{remarks:?}");
+}
+
+#[test]
+fn what_goes_by_the_resistance_needs_one() {
+    let recording = text(
+        "t_s,i_ref_a,v_cell_v",
+        cell(&[(300, 0.5), (300, 1.0)]).into_iter(),
+    );
+    let lacks = |model: &str| {
+        let (_, remarks) = one(model, &recording);
+        let says = |remark: &String| remark.contains("no ohmic_resistance_ohm: resistance");
+        remarks.iter().any(says)
+    };
+    assert!(!lacks(BATTERY));
+    assert!(lacks(&BATTERY.replace("ohmic_resistance_ohm = 0.01\n", "")));
 }
 
 #[test]

@@ -49,13 +49,14 @@ pub(super) fn missed(bench: &Workbench<'_>, shown: &Fit) -> Option<[f64; 2]> {
     }
     let problem = bench.problem;
     let noise = shown.sigma.max(problem.noise).hypot(problem.coloured.rms);
-    let reaching = reaching_out(problem, reach);
-    let off = reaching.iter().any(|row| {
-        bench
-            .rows
-            .binary_search(row)
-            .is_ok_and(|at| shown.residual[at].abs() > CERTAIN * noise + bench.inaccuracy(at))
-    });
+    // Of those that count: not what is repeated or empty.
+    let reaching: Vec<usize> = reaching_out(problem, reach)
+        .iter()
+        .filter_map(|row| bench.rows.binary_search(row).ok())
+        .collect();
+    let off = reaching
+        .iter()
+        .any(|&at| shown.residual[at].abs() > CERTAIN * noise + bench.inaccuracy(at));
     (off && reaching.len() as f64 <= MOST * bench.len() as f64).then_some(reach)
 }
 
@@ -86,4 +87,35 @@ pub(super) fn told(name: &str, [before_s, after_s]: [f64; 2]) -> String {
          did outside, by what is named",
         sides.join(" and ")
     )
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::explain::workbench::Member;
+
+    /// A sensor that is late by 5 s in a log of 400 s, measured in one row of ten and repeated in the others.
+    #[test]
+    fn repeats_are_no_readings_that_would_be_left_out() {
+        let late_s = 5.0;
+        let current = |t: f64| 10.0 * (0.37 * t).sin() + 3.0 * (1.91 * t).sin();
+        let t_s: Vec<f64> = (0..4000).map(|row| f64::from(row) * 0.1).collect();
+        let reference: Vec<f64> = t_s.iter().map(|t| current(*t)).collect();
+        // Before the log another current flowed.
+        let reading = t_s.iter().map(|t| {
+            let earlier = if *t < late_s { 100.0 } else { 0.0 };
+            current(t - late_s) + earlier
+        });
+        let mut problem = Problem::pair(t_s.clone(), reference, reading.collect(), 0.1);
+        problem.observed.valid = (0..4000).map(|row| row % 10 == 0).collect();
+        let bench = Workbench::new(&problem, &[]);
+        let effect = crate::effects::find_with("delay", 1).unwrap();
+        let values = vec![late_s];
+        let model = Model::default().with(Member { effect, values });
+        let shown = Fit::of(&bench, model, 0.0);
+        // Five readings, in fifty rows, of four hundred.
+        let reach = missed(&bench, &shown).unwrap();
+        assert_eq!(reach, [late_s, 0.0]);
+    }
 }

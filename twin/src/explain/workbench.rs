@@ -793,15 +793,7 @@ fn nearest(problem: &Problem, rows: &[usize]) -> Vec<f64> {
 
 /// The drive's row at which an observed one was taken, or the last before it.
 pub(super) fn drive_row(problem: &Problem, row: usize) -> Option<usize> {
-    let (drive, observed) = (&problem.drive, &problem.observed);
-    observed.drive_row(row).or_else(|| {
-        let range = drive.segments.get(observed.segment_of(row))?;
-        let times = &drive.t_s[range.clone()];
-        let at = times
-            .partition_point(|t| *t <= observed.t_s[row])
-            .saturating_sub(1);
-        (range.start + at < range.end).then_some(range.start + at)
-    })
+    problem.observed.drive_row_before(&problem.drive, row)
 }
 
 /// Standard deviation of one stamp of a series that is sent at even times, in s: each step has two. 0 where steps differ by more than

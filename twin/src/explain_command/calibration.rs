@@ -133,18 +133,25 @@ pub(super) fn calibrate(model: &Model, report: &Report) -> Calibration {
             }
         }
         let line = CORRECTIONS.iter().find(|(of, _, _)| *of == signal);
-        if let Some((_, gain, zero)) = line.filter(|_| lines != [Line::IDEAL; 2]) {
+        if let Some((_, gain, zero)) = line {
             let each = |of: fn(&Line) -> f64| lines.iter().map(of).collect();
-            wanted.push((*gain, each(|line| (1.0 / line.slope - 1.0) * 1e6)));
+            let is_off = lines != [Line::IDEAL; 2];
+            if is_off {
+                wanted.push((*gain, each(|line| (1.0 / line.slope - 1.0) * 1e6)));
+            }
             let mut zeros: Vec<f64> = each(|line| line.zero_a / line.slope * 1e6);
-            if signal == "q_meas_c" {
-                // The zero drift is taken from the charge as well: what is left of the zero is the meter's own.
+            // The zero drift is taken from the charge as well: what is left of the zero is the meter's own, and where the charge has none,
+            // its offset has to give back what the drift takes.
+            let drifts = signal == "q_meas_c" && zero_drift_ua.iter().any(|drift| *drift != 0.0);
+            if drifts {
                 zeros
                     .iter_mut()
                     .zip(&zero_drift_ua)
                     .for_each(|(zero, drift)| *zero -= drift);
             }
-            wanted.push((*zero, zeros));
+            if is_off || drifts {
+                wanted.push((*zero, zeros));
+            }
         }
         let mut heading = format!("\n# Corrects {signal}.");
         for (name, values) in wanted {
@@ -321,7 +328,11 @@ mod tests {
 
     /// The file's values by name, and the remarks, after these effects were found.
     fn found(effects: &[Found<'_>]) -> (toml::Table, Vec<String>) {
-        let model = Model::parse("m.toml", BOARD.to_owned(), Path::new("")).unwrap();
+        written(&reported(effects))
+    }
+
+    /// What is reported of these effects, signal by signal.
+    fn reported(effects: &[Found<'_>]) -> Report {
         let mut report = Report::default();
         for (signal, id, values) in effects {
             report.effects.push(EffectReport {
@@ -350,7 +361,13 @@ mod tests {
                 }),
             }
         }
-        let calibration = calibrate(&model, &report);
+        report
+    }
+
+    /// The file's values by name, and the remarks, of what was reported.
+    fn written(report: &Report) -> (toml::Table, Vec<String>) {
+        let model = Model::parse("m.toml", BOARD.to_owned(), Path::new("")).unwrap();
+        let calibration = calibrate(&model, report);
         let table: toml::Table = calibration.text.unwrap_or_default().parse().unwrap();
         let mut values = toml::Table::new();
         for register in table
@@ -393,6 +410,31 @@ mod tests {
             Some(-700_000)
         );
         assert!(remarks.is_empty(), "{remarks:?}");
+    }
+
+    /// The board takes its zero drift from the charge, too: of a counter that was right, the meter's offset gives it back.
+    #[test]
+    fn a_counter_that_is_right_stays_so() {
+        let mut report = reported(&[("i_meas_a", "offset", &[("offset_a", 0.5)])]);
+        report.models.push(FittedModel {
+            signal: "q_meas_c".to_owned(),
+            ..FittedModel::default()
+        });
+        let (values, remarks) = written(&report);
+        for side in ["small", "large"] {
+            assert_eq!(values["zero drift"][side].as_integer(), Some(500_000));
+            assert_eq!(values["meter: offset"][side].as_integer(), Some(-500_000));
+        }
+        assert!(!values.contains_key("meter: gain"), "{values:?}");
+        assert!(remarks.is_empty(), "{remarks:?}");
+        // A gain has no part in it.
+        report = reported(&[("i_meas_a", "gain", &[("gain", 1.25)])]);
+        report.models.push(FittedModel {
+            signal: "q_meas_c".to_owned(),
+            ..FittedModel::default()
+        });
+        let (values, _) = written(&report);
+        assert!(!values.contains_key("meter: offset"), "{values:?}");
     }
 
     /// A gain and an offset are `gain·i + offset`, whichever was found first.

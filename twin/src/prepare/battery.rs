@@ -67,6 +67,17 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
     let parts = series::drive(work.drive_frame(), found);
     let mut drive = parts.drive;
     work.surroundings(&mut drive, &parts.rows);
+    let is_voltage = |(view, _): &(View, &str)| *view == View::Voltage;
+    if work.purpose == Purpose::Compare
+        && battery.resistance_ohm == 0.0
+        && views.iter().any(is_voltage)
+    {
+        work.remark(
+            "[battery] has no ohmic_resistance_ohm: resistance, charge-transfer, polarisation and diffusion, whose sizes go by it, are not \
+             looked for"
+                .to_owned(),
+        );
+    }
     let counter_ah = work.drive_frame().column(COUNTER);
     let counter_ah: Option<Vec<f64>> =
         counter_ah.map(|ah| parts.rows.iter().map(|row| ah[*row]).collect());
@@ -119,8 +130,8 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             },
         };
         if work.purpose.compares() {
-            let source = work.frame.source();
-            checks::battery(view, &drive, &observed, &base, [source, name, &current])?;
+            let frames = [work.frame, work.drive_frame()];
+            checks::battery(view, &drive, &observed, &base, frames, [name, &current])?;
         }
         let (noise, coloured, accuracy) = match view {
             View::StateOfCharge => (battery.noise_pct, Coloured::default(), battery.accuracy_pct),

@@ -83,7 +83,7 @@ pub(super) fn item(
         .iter()
         .fold(0.0_f64, |most, i| most.max(i.abs()));
     if work.purpose.compares() {
-        checks::counter(drive, &readings, interval_s, work.frame.source(), column)?;
+        checks::counter(drive, &readings, interval_s, work.frame, column)?;
     }
     let (drive, mut observed, rows, resets) =
         differences(drive, &readings, &rows, interval_s, step_c, largest);

@@ -16,6 +16,8 @@ use crate::{
 const POWER_WITHIN: f64 = 2.0;
 /// Below this correlation with its reference a sensor counts the other way round.
 const OPPOSITE: f64 = -0.5;
+/// Above this correlation, or below its opposite, a factor between the two is one of units: noise moves by any factor less.
+const RELATED: f64 = 0.5;
 /// Of one and the same current it is below this.
 const SURELY_OPPOSITE: f64 = -0.8;
 /// Below this magnitude of correlation the two have nothing in common.
@@ -403,16 +405,20 @@ pub(super) fn pair(
     drive: &Drive,
     observed: &Observed,
     wild: &Wild,
-    source: &str,
+    frame: &Frame,
     [reference, measured]: [&str; 2],
 ) -> Result<(), Failure> {
+    let source = frame.source();
     let pairs = beside(drive, observed, &wild.rows);
     if pairs.clone().count() < FEWEST_ROWS {
         return Ok(());
     }
     let spread_x = spread(pairs.clone().map(|(reference, _)| reference));
     let spread_y = spread(pairs.clone().map(|(_, reading)| reading));
-    if let Some(power) = thousands(spread_x / spread_y) {
+    let together = correlation(pairs);
+    if together.abs() > RELATED
+        && let Some(power) = thousands(spread_x / spread_y)
+    {
         let (large, small) = if power > 0 {
             (reference, measured)
         } else {
@@ -426,7 +432,6 @@ pub(super) fn pair(
             spread_x.min(spread_y)
         )));
     }
-    let together = correlation(pairs);
     if (SURELY_OPPOSITE..OPPOSITE).contains(&together) {
         return Err(Failure::Input(format!(
             "{source}: {measured} falls where {reference} rises, but only loosely (correlation {together:.2}): found two signals \
@@ -436,7 +441,8 @@ pub(super) fn pair(
     if together < OPPOSITE {
         return Err(Failure::Input(format!(
             "{source}: {measured} falls where {reference} rises (correlation {together:.2}): found opposite signs, expected \
-             discharge positive in both; to turn one: --map {measured}=-{measured}"
+             discharge positive in both; to turn one: --map {}",
+            frame.turned(measured)
         )));
     }
     Ok(())
@@ -452,9 +458,10 @@ pub(super) fn counter(
     drive: &Drive,
     readings: &Observed,
     interval_s: f64,
-    source: &str,
+    frame: &Frame,
     column: &str,
 ) -> Result<(), Failure> {
+    let source = frame.source();
     let charge_c = integral(&drive.t_s, &drive.segments, &drive.reference, false);
     let charge = Drive {
         reference: charge_c.into(),
@@ -519,7 +526,8 @@ pub(super) fn counter(
     if together < 0.0 {
         return Err(Failure::Input(format!(
             "{source}: {column} falls where the reference's charge rises (correlation {together:.2}): found opposite signs, \
-             expected discharge positive in both; to turn one: --map {column}=-{column}"
+             expected discharge positive in both; to turn one: --map {}",
+            frame.turned(column)
         )));
     }
     Ok(())
@@ -705,8 +713,10 @@ pub(super) fn battery(
     drive: &Drive,
     observed: &Observed,
     base: &BatteryBase,
-    [source, name, current]: [&str; 3],
+    [frame, of_current]: [&Frame; 2],
+    [name, current]: [&str; 2],
 ) -> Result<(), Failure> {
+    let source = frame.source();
     let pairs = beside(drive, observed, &[]);
     if pairs.clone().count() < FEWEST_ROWS {
         return Ok(());
@@ -770,7 +780,8 @@ pub(super) fn battery(
     if together > -OPPOSITE {
         return Err(Failure::Input(format!(
             "{source}: {name} rises where {current} rises (correlation {together:.2}): found charging positive, expected discharge \
-             positive; to turn it: --map {current}=-{current}"
+             positive; to turn it: --map {}",
+            of_current.turned(current)
         )));
     }
     Ok(())

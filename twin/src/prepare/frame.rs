@@ -51,6 +51,16 @@ impl Frame {
         })
     }
 
+    /// What `--map` has to say for a column to have the other sign than it has now.
+    pub fn turned(&self, name: &str) -> String {
+        let named = self.named.iter().find(|(known, _)| known == name);
+        let column = named.map_or(name, |(_, column)| column);
+        match column.strip_prefix('-') {
+            Some(plain) => format!("{name}={plain}"),
+            None => format!("{name}=-{column}"),
+        }
+    }
+
     /// Whether there is such a column.
     pub fn has(&self, name: &str) -> bool {
         self.recording.column(name).is_some()

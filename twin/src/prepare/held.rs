@@ -1,7 +1,9 @@
 //! Which readings are new, and which are held ones that were read again.
 
+use std::borrow::Cow;
+
 use super::Frame;
-use super::series::median;
+use super::series::{between_rows, median, share_rows};
 use crate::range::range;
 
 /// Share of repeats, while the reference moves, from which a sensor is read more often than it measures.
@@ -35,8 +37,8 @@ impl Freshness {
     }
 }
 
-/// Decides it for one column. `beside` says that the reference has the same rows; without one, changes of the value
-/// have to tell.
+/// Decides it for one column. `beside` says that the reference is in the same file, on the same rows or on others; without one, changes
+/// of the value have to tell.
 ///
 /// `stated_s` is the time between two new readings by design, 0 if nothing is stated.
 ///
@@ -62,12 +64,11 @@ pub fn freshness(
         pairs().filter(|(before, after)| same(*before, *after)),
         value,
     );
+    let beside = beside.then(|| at_readings(frame, reference, value));
     let moves = |before: usize, after: usize| {
-        if beside {
+        beside.as_ref().is_none_or(|reference| {
             (reference[after] - reference[before]).abs() > MOVING_STEPS * step
-        } else {
-            true
-        }
+        })
     };
     let (mut moved, mut repeated, mut at_once) = (0_usize, 0_usize, 0_usize);
     let mut last_repeat = None;
@@ -140,6 +141,19 @@ pub fn freshness(
     Freshness {
         rows: fresh,
         interval_s: Some(interval_s),
+    }
+}
+
+/// The reference where the readings are: as it was recorded where the two share their rows, else in straight lines between its rows, as
+/// everywhere (its last value would jump where a slow one comes, and readings would seem to stay).
+fn at_readings<'a>(frame: &Frame, reference: &'a [f64], value: &[f64]) -> Cow<'a, [f64]> {
+    let known: Vec<usize> = (0..reference.len())
+        .filter(|row| reference[*row].is_finite())
+        .collect();
+    if share_rows(&known, value) {
+        Cow::Borrowed(reference)
+    } else {
+        Cow::Owned(between_rows(frame, reference))
     }
 }
 

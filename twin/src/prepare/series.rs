@@ -98,6 +98,25 @@ pub(super) fn share_rows(rows: &[usize], value: &[f64]) -> bool {
     in_drive as f64 >= TOGETHER * all as f64
 }
 
+/// A series at every row of its file: in straight lines between those that have it, NaN ahead of the first and after the last of a clock.
+pub(super) fn between_rows(frame: &Frame, values: &[f64]) -> Vec<f64> {
+    let t_s = frame.t_s();
+    let mut every = values.to_vec();
+    for clock in frame.clocks() {
+        let mut last: Option<usize> = None;
+        for row in clock.clone().filter(|row| values[*row].is_finite()) {
+            if let Some(from) = last.replace(row) {
+                let step_s = t_s[row] - t_s[from];
+                for between in from + 1..row {
+                    let share = (t_s[between] - t_s[from]) / step_s.max(f64::MIN_POSITIVE);
+                    every[between] = values[from] + share * (values[row] - values[from]);
+                }
+            }
+        }
+    }
+    every
+}
+
 /// An observation on the drive's own rows.
 pub(super) fn drive_rows(
     drive: &Drive,
