@@ -47,7 +47,7 @@ pub enum Error<E> {
     Identity([u8; 3]),
     /// Still busy after the longest time.
     Timeout,
-    /// A write was not enabled: the chip is protected or not there.
+    /// A write was not enabled: the chip is protected, busy or not there.
     NotEnabled,
     /// Beyond the chip's end.
     OutOfBounds,
@@ -150,7 +150,8 @@ impl<SPI: SpiDevice> Flash<SPI> {
 
     fn enable_write(&mut self) -> Result<(), Error<SPI::Error>> {
         self.0.write(&[WRITE_ENABLE]).map_err(Error::Bus)?;
-        if self.status()? & STATUS_WRITE_ENABLED == 0 {
+        // An erase keeps the latch set for as long as it runs, and what is written meanwhile is ignored.
+        if self.status()? & (STATUS_BUSY | STATUS_WRITE_ENABLED) != STATUS_WRITE_ENABLED {
             return Err(Error::NotEnabled);
         }
         Ok(())

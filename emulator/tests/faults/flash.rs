@@ -946,6 +946,40 @@ fn fault_f24_an_erase_under_way_does_not_cost_the_configuration() {
     assert!(!was_raised(&rig, "FlashFault"));
 }
 
+/// Such a sector is erased anew by the first that reads: 400 ms of the slowest chip are within the start.
+#[test]
+fn fault_f21_a_start_that_has_to_mend_the_flash_has_its_charge() {
+    let flash = used_flash();
+    let mut torn = flash.clone();
+    // The sector behind the newest: set at its begin and not at its end.
+    for byte in &mut torn[0x1_0000..0x1_1000] {
+        *byte |= 0x5A;
+    }
+    torn[0x1_0000] = 0xFF;
+    torn[0x1_0FFF] = 0;
+    let mut charges = Vec::new();
+    for flash in [flash, torn] {
+        let mut rig = boot_parked(flash, Timing::SLOWEST, 0.0);
+        let first_s = until(&mut rig, "a valid current", 1.1, |rig| {
+            rig.view.current_a().valid().is_some()
+        });
+        rig.run_s(1.5).unwrap();
+        println!(
+            "F21 a start that mends: valid after {:.0} ms, {:.1} C, {:?}",
+            first_s * 1e3,
+            charge_c(&rig),
+            unexpected(&rig, &[])
+        );
+        assert_eq!(capacity(&mut rig), 100_000);
+        assert!(!was_raised(&rig, "FlashFault"));
+        assert!(!was_raised(&rig, "ConfigurationDefault"));
+        assert_eq!(resets(&rig), 0);
+        charges.push(charge_c(&rig));
+    }
+    assert!(charges[0] > 1_000.0);
+    assert!((charges[1] - charges[0]).abs() < 0.1, "{charges:?}");
+}
+
 #[test]
 fn fault_f21_the_charge_is_saved_while_the_log_is_cleared() {
     let mut rig = boot_parked(used_flash(), Timing::TYPICAL, 0.4);
