@@ -1076,7 +1076,7 @@ fn surroundings_are_sent_with_their_validity() {
     bench.run_ms(10);
     assert!(bench.measurement.environment().supply < Millivolts(5_005));
     bench.run_ms(1_000);
-    // Factors are worked out anew per millivolt.
+    // Factors are worked out anew by steps of 3 mV; what is reported is the mean itself.
     let supply = bench.measurement.environment().supply;
     assert!(
         (Millivolts(5_019)..=Millivolts(5_020)).contains(&supply),
