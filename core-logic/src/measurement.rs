@@ -213,8 +213,6 @@ pub struct Tick {
     pub hv_permit: bool,
     /// Diagnoses that came and went.
     pub changes: Changes,
-    /// A setting to be stored.
-    pub found: Option<Found>,
 }
 
 /// The supply is averaged over 2⁵ readings: one code of ADC1 is 1.6 mV of a 5 V supply, and one of its reference, which stands for
@@ -304,7 +302,10 @@ pub struct Measurement {
     history: RangeHistory,
     diagnosis: Diagnosis,
     effects: Effects,
+    /// Of an order, until it is taken.
     found: Option<Found>,
+    /// The key factors in use are others than those that were taken last. Apart from the above: a key cycle ends when it does.
+    factors_found: bool,
     order_outcome: (CommandState, u16),
     /// The newest order is a key-state calibration, and it has not ended.
     key_ordered: bool,
@@ -519,6 +520,7 @@ impl Measurement {
             diagnosis: Diagnosis::default(),
             effects: Effects::default(),
             found: None,
+            factors_found: false,
             order_outcome: (CommandState::None, 0),
             key_ordered: false,
             loss,
@@ -824,7 +826,7 @@ impl Measurement {
         if let Some(factors) = self.key_outputs.new_factors {
             self.prepare_again(configuration, factors, self.prepared.supply, now);
             self.compare.restart_at(meter_follows(now));
-            self.found = Some(Found::KeyFactors(factors));
+            self.factors_found = true;
         }
         if self.key_ordered {
             self.follow_key_order();
@@ -838,8 +840,16 @@ impl Measurement {
         Tick {
             hv_permit: self.key_outputs.hv_permit,
             changes,
-            found: self.found.take(),
         }
+    }
+
+    /// A setting to be stored, each one once: zero drift or supply relations before the key factors.
+    pub fn take_found(&mut self) -> Option<Found> {
+        let has_factors = self.found.is_none() && core::mem::take(&mut self.factors_found);
+        if has_factors {
+            return Some(Found::KeyFactors(self.key.factors()));
+        }
+        self.found.take()
     }
 
     /// Carries out an order of a client. What takes time ends in `command state` and `command reason`.
@@ -1510,7 +1520,7 @@ impl Measurement {
             Activity::None
         };
         readings.activity_progress = percent(taken, of);
-        // What was found is a setting only once the next tick has handed it over.
+        // What was found is a setting only once it was taken.
         (readings.command_state, readings.command_reason) = match self.found {
             Some(_) => (CommandState::Running, 0),
             None => self.order_outcome,

@@ -709,7 +709,7 @@ mod app {
             let total = server.counters().communication_errors;
             let found = cx.shared.center.lock(|center| {
                 center.conditions.rs485_errors |= total != errors;
-                center.found.take()
+                center.measurement.take_found()
             });
             errors = total;
             let check = elapsed(checked, now) >= Duration::from_ticks(1_000_000);
