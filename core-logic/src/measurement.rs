@@ -213,12 +213,16 @@ pub struct Tick {
     pub hv_permit: bool,
     /// Diagnoses that came and went.
     pub changes: Changes,
-    /// A setting to be stored.
-    pub found: Option<Found>,
 }
 
-/// The supply is averaged over 2⁴ readings: one conversion of ADC1 is 1.6 mV of a 5 V supply.
-const SUPPLY_SHIFT: u32 = 4;
+/// The supply is averaged over 2⁵ readings: one code of ADC1 is 1.6 mV of a 5 V supply, and one of its reference, which stands for
+/// two readings, 3.3 mV. Of 1 code of noise (rms) that leaves 3.3 mV · √(1/31) and 1.6 mV · √(1/63): 0.63 mV.
+const SUPPLY_SHIFT: u32 = 5;
+/// New factors are worked out for a mean that has moved so far: 0.06 % of the meter's scale, of the 0.1 % that
+/// [`design::SUPPLY_RESIDUAL`] allows. Each time the converter's comparison with the meter begins anew, which takes 2 … 3 s, and
+/// the noise above, 4.8 times less, moves no further in minutes.
+const SUPPLY_STEP: Microvolts = Microvolts::from_millivolts(3);
+const _: () = assert!(SUPPLY_STEP.get() / 5 < design::SUPPLY_RESIDUAL.get());
 /// A reading further than this from the mean is no noise: the mean begins anew there. Half a per cent, which the meter's
 /// scale would be wrong by for as long as the mean takes to follow; the converter's noise is a tenth of it.
 const SUPPLY_JUMP: Microvolts = Microvolts::from_millivolts(25);
@@ -298,7 +302,10 @@ pub struct Measurement {
     history: RangeHistory,
     diagnosis: Diagnosis,
     effects: Effects,
+    /// Of an order, until it is taken.
     found: Option<Found>,
+    /// The key factors in use are others than those that were taken last. Apart from the above: a key cycle ends when it does.
+    factors_found: bool,
     order_outcome: (CommandState, u16),
     /// The newest order is a key-state calibration, and it has not ended.
     key_ordered: bool,
@@ -513,6 +520,7 @@ impl Measurement {
             diagnosis: Diagnosis::default(),
             effects: Effects::default(),
             found: None,
+            factors_found: false,
             order_outcome: (CommandState::None, 0),
             key_ordered: false,
             loss,
@@ -818,7 +826,7 @@ impl Measurement {
         if let Some(factors) = self.key_outputs.new_factors {
             self.prepare_again(configuration, factors, self.prepared.supply, now);
             self.compare.restart_at(meter_follows(now));
-            self.found = Some(Found::KeyFactors(factors));
+            self.factors_found = true;
         }
         if self.key_ordered {
             self.follow_key_order();
@@ -832,8 +840,16 @@ impl Measurement {
         Tick {
             hv_permit: self.key_outputs.hv_permit,
             changes,
-            found: self.found.take(),
         }
+    }
+
+    /// A setting to be stored, each one once: zero drift or supply relations before the key factors.
+    pub fn take_found(&mut self) -> Option<Found> {
+        let has_factors = self.found.is_none() && core::mem::take(&mut self.factors_found);
+        if has_factors {
+            return Some(Found::KeyFactors(self.key.factors()));
+        }
+        self.found.take()
     }
 
     /// Carries out an order of a client. What takes time ends in `command state` and `command reason`.
@@ -957,7 +973,7 @@ impl Measurement {
         if self.zero.is_running() {
             return Err(Refusal::Busy);
         }
-        let supply = self.prepared.supply.ok_or(Refusal::SupplyUnknown)?;
+        let supply = self.mean_supply().ok_or(Refusal::SupplyUnknown)?;
         let usable = self
             .reading
             .validity
@@ -1116,7 +1132,7 @@ impl Measurement {
         supply: Option<Microvolts>,
         now: Instant,
     ) {
-        let mean = supply.map(|supply| {
+        self.supply_sum = supply.map(|supply| {
             let new = i64::from(supply.get());
             let follows = self
                 .supply_sum
@@ -1126,20 +1142,22 @@ impl Measurement {
                 // Converter and sensor are there before the meter's factors are.
                 self.compare.restart_at(meter_follows(now));
             }
-            self.supply_sum = Some(sum);
-            Microvolts(clamp_i32(sum >> SUPPLY_SHIFT))
+            sum
         });
-        if mean.is_none() {
-            self.supply_sum = None;
-        }
-        // Below a millivolt, 20 ppm of the supply, new factors would be worked out for noise.
+        let mean = self.mean_supply();
         let moved = match (mean, self.prepared.supply) {
-            (Some(new), Some(old)) => new.saturating_sub(old).saturating_abs().get() >= 1_000,
+            (Some(new), Some(old)) => new.saturating_sub(old).saturating_abs() >= SUPPLY_STEP,
             (new, old) => new.is_some() != old.is_some(),
         };
         if moved {
             self.prepare_again(configuration, self.key.factors(), mean, now);
         }
+    }
+
+    /// The supply by itself; the factors in use are of one up to [`SUPPLY_STEP`] beside it.
+    fn mean_supply(&self) -> Option<Microvolts> {
+        self.supply_sum
+            .map(|sum| Microvolts(clamp_i32(sum >> SUPPLY_SHIFT)))
     }
 
     /// The meter's mean current while nothing speaks against it.
@@ -1395,7 +1413,7 @@ impl Measurement {
     #[must_use]
     pub fn environment(&self) -> can::Environment {
         let missing = self.environment_is_missing();
-        let supply = self.prepared.supply.unwrap_or_default();
+        let supply = self.mean_supply().unwrap_or_default();
         let validity =
             |is_there: bool| Validity::VALID.and_if(missing || !is_there, Validity::STALE);
         can::Environment {
@@ -1502,7 +1520,7 @@ impl Measurement {
             Activity::None
         };
         readings.activity_progress = percent(taken, of);
-        // What was found is a setting only once the next tick has handed it over.
+        // What was found is a setting only once it was taken.
         (readings.command_state, readings.command_reason) = match self.found {
             Some(_) => (CommandState::Running, 0),
             None => self.order_outcome,
@@ -1544,7 +1562,7 @@ impl Measurement {
         readings.pack_voltage = self.pack_voltage.unwrap_or_default();
         readings.cell_validity =
             Validity::VALID.and_if(self.cell_voltage_is_missing(), Validity::STALE);
-        readings.supply = self.prepared.supply.unwrap_or_default();
+        readings.supply = self.mean_supply().unwrap_or_default();
         readings.supply_validity = environment.supply_validity;
         readings.network_voltage = self.environment.network.unwrap_or_default();
         readings.mcu_supply = self.environment.controller_supply.unwrap_or_default();
@@ -1651,6 +1669,47 @@ mod tests {
         measurement.average_supply(&configuration, Some(Microvolts(4_900_000)), at(10_000));
         assert!(!measurement.check_factors(&basis, &prepared));
         assert_eq!(measurement.prepared.supply, Some(Microvolts(4_900_000)));
+    }
+
+    /// By one code of noise, rms, in each conversion of ADC1: the reference stands for two readings, as `firmware/src/analog.rs`
+    /// converts it. Each change makes the converter's comparison with the meter begin anew.
+    #[test]
+    fn noise_of_one_code_leaves_the_factors_for_minutes() {
+        const VDDA_UV: f64 = 3_300_000.0;
+        let configuration = Configuration::default();
+        let mut measurement = Measurement::new(&configuration, None, Nanocoulombs::ZERO, at(0));
+        let mut state = 0x9E37_79B9_7F4A_7C15_u64;
+        // Twelve uniform ones are a normal one.
+        let mut noise = || {
+            (0..12).fold(-6.0, |sum, _| {
+                state ^= state << 13;
+                state ^= state >> 7;
+                state ^= state << 17;
+                sum + (state >> 11) as f64 / (1_u64 << 53) as f64
+            })
+        };
+        let (mut vdda_uv, mut changes, mut number) = (VDDA_UV, Vec::new(), 0);
+        for tick in 0..60_000_u64 {
+            if tick % 2 == 0 {
+                let reference = 1.21e6 / VDDA_UV * 4_096.0;
+                vdda_uv *= VDDA_UV / vdda_uv * reference / (reference + noise()).round();
+            }
+            let code = (2.5e6 / VDDA_UV * 4_096.0 + noise()).round();
+            let supply = Microvolts((code * vdda_uv * 2.0 / 4_096.0) as i32);
+            measurement.average_supply(&configuration, Some(supply), at(tick * 10_000));
+            if core::mem::replace(&mut number, measurement.basis_number) != measurement.basis_number
+            {
+                changes.push(tick);
+            }
+        }
+        let longest = changes.windows(2).map(|pair| pair[1] - pair[0]).max();
+        let used = measurement.prepared.supply.unwrap();
+        assert!(changes.len() < 40, "{} in 10 min", changes.len());
+        assert!(longest > Some(6_000), "{longest:?} ticks");
+        // What the factors are off by, and the mean with its noise.
+        assert!(used.saturating_sub(Microvolts(5_000_000)).saturating_abs() < Microvolts(5_000));
+        let mean = measurement.mean_supply().unwrap();
+        assert!(mean.saturating_sub(used).saturating_abs() < SUPPLY_STEP);
     }
 
     /// The meter's factors are handed over again at each check, by the same number; by another one after a change.

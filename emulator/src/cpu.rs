@@ -502,6 +502,13 @@ impl Cpu {
         self.refresh();
     }
 
+    /// Pends NMI.
+    pub fn raise_nmi(&mut self) {
+        self.core
+            .with_sys(|sys| sys.set_pending(Exception::NMI, true));
+        self.refresh();
+    }
+
     /// Whether a sleeping core would wake at the next step. `rsemu` wakes for any enabled exception that is pending, also one
     /// that BASEPRI masks (the architecture allows a wake-up without cause, B1.5.19).
     pub fn wake_pending(&self) -> bool {
@@ -608,8 +615,8 @@ fn latch(sys: &mut Sys, levels: &[u32; 4]) {
 fn is_any_due(sys: &Sys, levels: &[u32; 4]) -> bool {
     (0..levels.len()).any(|word| {
         let pending = sys.pending[word] | levels[word] & !sys.active[word];
-        // MemManage, BusFault and UsageFault have their enable bits elsewhere.
-        let always = if word == 0 { 0b111_0000 } else { 0 };
+        // MemManage, BusFault and UsageFault have their enable bits elsewhere, NMI has none.
+        let always = if word == 0 { 0b111_0100 } else { 0 };
         pending & (sys.enable[word] | always) != 0
     })
 }
@@ -798,6 +805,21 @@ mod tests {
             cpu.step();
             assert_eq!(cpu.current_exception(), 16 + irq);
         }
+    }
+
+    #[test]
+    fn nmi_is_taken_through_every_mask_and_wakes() {
+        // CPSID i, then asleep.
+        let (mut cpu, _) = program(&[0xB672, NOP, WFI, HERE], &[HERE], &[HERE]);
+        for _ in 0..8 {
+            cpu.step();
+        }
+        assert!(cpu.is_asleep() && !cpu.wake_pending());
+        cpu.raise_nmi();
+        assert!(cpu.wake_pending());
+        cpu.step();
+        cpu.step();
+        assert_eq!((cpu.pc(), cpu.current_exception()), (SECOND_HANDLER, 2));
     }
 
     #[test]

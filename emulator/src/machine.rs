@@ -317,6 +317,17 @@ impl<'table> Machine<'table> {
         self.bus.with_clocks(work)
     }
 
+    /// The crystal stops; with clock security on, that is an NMI.
+    pub fn stop_crystal(&mut self) {
+        let now = self.now;
+        let is_found = self.bus.with_clocks(|rcc, _| rcc.stop_crystal(now));
+        // Everything runs from HSI then.
+        self.bus.advance(now);
+        if is_found {
+            self.cpu.raise_nmi();
+        }
+    }
+
     /// The core, for diagnosis.
     pub const fn cpu(&self) -> &Cpu {
         &self.cpu

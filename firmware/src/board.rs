@@ -120,8 +120,14 @@ impl Edges {
                 self.recorder.resume(now, self.flag.is_high());
                 true
             }
-            _ if self.guard.is_masked() => false,
-            _ => self.recorder.observe(now, self.flag.is_high()),
+            _ => {
+                // Of an edge before this look the pending bit tells at the next one, and its handler, held off by the caller's lock,
+                // records it as soon as that ends. Recorded here as well it would count three times.
+                let is_high = self.flag.is_high();
+                !self.guard.is_masked()
+                    && !self.flag.check_interrupt()
+                    && self.recorder.observe(now, is_high)
+            }
         }
     }
 

@@ -6,7 +6,7 @@ use core_logic::{
     converter::ConverterSample,
     diagnosis::{Code, CodeSet},
     gap::GapBridge,
-    measurement::{ConverterFault, Environment, Found, Measurement, Vehicle},
+    measurement::{ConverterFault, Environment, Measurement, Vehicle},
     meter::{MeterCalibration, MeterReport},
     modbus::Readings,
     range::RangeHistory,
@@ -74,8 +74,6 @@ pub struct Center {
     pub bus: Bus,
     /// Reports of others.
     pub conditions: Conditions,
-    /// A setting that a calibration has found, for the owner of the configuration.
-    pub found: Option<Found>,
     /// Diagnoses have come or gone: a log record is due.
     pub log_due: bool,
     /// Who the board is.
@@ -126,7 +124,6 @@ impl Center {
             configuration,
             bus,
             conditions: Conditions::default(),
-            found: None,
             log_due: false,
             identity,
             converter: converter::Counters::default(),
@@ -211,9 +208,6 @@ impl Center {
         let tick = self
             .measurement
             .tick(&self.configuration, now, &vehicle, history, external);
-        if let Some(found) = tick.found {
-            self.found = Some(found);
-        }
         for code in tick.changes.set.iter() {
             // Not `rotate_right`: it alone would need `memmove`, 1.6 kB.
             let mut newer = code.number();

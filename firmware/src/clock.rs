@@ -54,6 +54,9 @@ pub fn start(rcc: &RCC, flash: &FLASH, debug: &DBGMCU) {
     while rcc.cr().read().pllrdy().bit_is_clear() {}
     rcc.cfgr().modify(|_, w| w.sw().pll());
     while !rcc.cfgr().read().sws().is_pll() {}
+    // A crystal that stops later would leave a PLL without its reference, and every time wrong: clock security goes back to HSI and
+    // raises NMI, for which there is no handler (`fault`).
+    rcc.cr().modify(|_, w| w.csson().set_bit());
 }
 
 /// Logs it if the option bytes let the core go on below 2.7 V, where five wait states are too few: nothing but the brown-out

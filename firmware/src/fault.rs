@@ -112,7 +112,7 @@ fn is_udf(pc: u32) -> bool {
     instruction & 0xFF00 == 0xDE00
 }
 
-/// Anything else that has no handler.
+/// Anything else that has no handler; NMI among it, of a crystal that has stopped (`clock`).
 #[exception]
 unsafe fn DefaultHandler(_number: i16) -> ! {
     let number = SCB::vect_active();

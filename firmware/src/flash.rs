@@ -47,7 +47,7 @@ pub enum Error<E> {
     Identity([u8; 3]),
     /// Still busy after the longest time.
     Timeout,
-    /// A write was not enabled: the chip is protected or not there.
+    /// A write was not enabled: the chip is protected, busy or not there.
     NotEnabled,
     /// Beyond the chip's end.
     OutOfBounds,
@@ -139,9 +139,19 @@ impl<SPI: SpiDevice> Flash<SPI> {
         Ok(())
     }
 
+    /// Four bytes, the first as the highest; 0 where they cannot be read. 5 µs.
+    pub fn word(&mut self, at: u32) -> u32 {
+        let mut word = [0; 4];
+        match self.transfer(&command(READ, at), &mut word) {
+            Ok(()) => u32::from_be_bytes(word),
+            Err(_) => 0,
+        }
+    }
+
     fn enable_write(&mut self) -> Result<(), Error<SPI::Error>> {
         self.0.write(&[WRITE_ENABLE]).map_err(Error::Bus)?;
-        if self.status()? & STATUS_WRITE_ENABLED == 0 {
+        // An erase keeps the latch set for as long as it runs, and what is written meanwhile is ignored.
+        if self.status()? & (STATUS_BUSY | STATUS_WRITE_ENABLED) != STATUS_WRITE_ENABLED {
             return Err(Error::NotEnabled);
         }
         Ok(())

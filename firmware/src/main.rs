@@ -116,6 +116,10 @@ mod app {
     /// comes first, 25 ms after an erase that a reset left running, 400 ms. The state takes 0.1 s more at most, and in
     /// that case it is in RAM as well. The watchdog bites after 680 ms at the earliest.
     const LOAD_LIMIT_MS: u32 = 450;
+    /// The same after a loss of power, which may have cut an erase off: sequential-storage erases that sector anew as it reads,
+    /// 400 ms, or passes over what is left in it byte by byte, 0.13 s. A chip that does not answer is waited for no longer than
+    /// above. The tasks' own check-in begins at [`START_LIMIT`], and this task's goes on while it waits for the flash.
+    const MENDING_LOAD_LIMIT_MS: u32 = 900;
     /// Every task has to check in from here on, started or not.
     const START_LIMIT: Duration = Duration::from_ticks(1_000_000);
     #[expect(clippy::cast_possible_truncation, reason = "20 ms")]
@@ -705,7 +709,7 @@ mod app {
             let total = server.counters().communication_errors;
             let found = cx.shared.center.lock(|center| {
                 center.conditions.rs485_errors |= total != errors;
-                center.found.take()
+                center.measurement.take_found()
             });
             errors = total;
             let check = elapsed(checked, now) >= Duration::from_ticks(1_000_000);
@@ -889,9 +893,13 @@ mod app {
     async fn store(mut cx: storage::Context<'_>, pace: Pace<'_>) -> Infallible {
         let storage = cx.local.storage;
         let (mut stored, mut state) = (Stored::Refused, Stored::Refused);
+        let answers_by = pace::now() + LOAD_LIMIT_MS.millis();
         let load = async {
             // A chip that answers late or wrongly once, or still erases, must not cost the calibration.
             while !storage.start(pace).await {
+                if pace::has_come(answers_by) {
+                    return;
+                }
                 alive(Task::Storage);
                 pace.pause(2).await;
             }
@@ -899,7 +907,12 @@ mod app {
             state = storage.state(pace).await;
         };
         // What has not come in time counts as refused.
-        pace.limited(LOAD_LIMIT_MS, pin!(load)).await;
+        let limit_ms = if cx.local.previous.cause.may_have_cut_off() {
+            MENDING_LOAD_LIMIT_MS
+        } else {
+            LOAD_LIMIT_MS
+        };
+        pace.limited(limit_ms, pin!(load)).await;
         if !storage.is_ready() {
             defmt::error!("flash not ready");
         }

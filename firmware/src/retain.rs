@@ -108,6 +108,11 @@ impl ResetCause {
         self.0 & Self::POWER_ON != 0
     }
 
+    /// Whether the flash may have lost its supply within an erase. A power-on sets this flag as well (RM0090, `RCC_CSR`).
+    pub const fn may_have_cut_off(self) -> bool {
+        self.0 & Self::BROWN_OUT != 0
+    }
+
     /// The first cause in the order of their weight.
     pub const fn describe(self) -> &'static str {
         match self.0 {

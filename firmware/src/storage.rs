@@ -18,7 +18,7 @@ use core_logic::{
     configuration::{self, Configuration, ConfigurationError, MAX_RECORD},
     retained::{LogRecord, MAX_LOG_BYTES, MAX_STATE_BYTES, RetainedState},
 };
-use embedded_storage_async::nor_flash::{NorFlash, ReadNorFlash};
+use embedded_storage_async::nor_flash::NorFlash;
 use sequential_storage::{
     Error,
     cache::Cache,
@@ -216,7 +216,7 @@ impl Storage {
         }
         // Nothing intact in a region that is not blank: there was a record once, and it is damaged.
         let end = region.end;
-        if length.is_none() && self.first_written(pace, region).await < end {
+        if length.is_none() && self.first_written(region) < end {
             count(&mut self.counters.refused);
             self.failed = true;
             return Err(());
@@ -235,18 +235,9 @@ impl Storage {
     }
 
     /// The region's first sector that was written, or cannot be read; its end without one.
-    async fn first_written(&mut self, pace: Pace<'_>, region: Range<u32>) -> u32 {
+    fn first_written(&mut self, region: Range<u32>) -> u32 {
         let mut at = region.start;
-        while at < region.end {
-            let mut mark = [0; 4];
-            if Lent(&mut self.flash, pace)
-                .read(at, &mut mark)
-                .await
-                .is_err()
-                || mark != [0xFF; 4]
-            {
-                break;
-            }
+        while at < region.end && self.flash.word(at) == u32::MAX {
             at += SECTOR;
         }
         at
@@ -297,11 +288,19 @@ impl Storage {
             QueueStorage::new(Lent(&mut self.flash, pace), config, Cache::new_uncached());
         let mut full = false;
         let result = loop {
-            let result = queue.push(record, full).await;
-            if full || !matches!(result, Err(Error::FullStorage)) {
-                break result;
+            match queue.push(record, full).await {
+                Err(Error::FullStorage) if !full => full = true,
+                // Its own repair passes over a sector that a cut-off erase has left with its begin marked and its end not.
+                Err(Error::Corrupted {}) if !full => {
+                    full = true;
+                    let region = queue.flash_range();
+                    let chip = queue.flash();
+                    let at = torn(&mut chip.0, region);
+                    // The next try tells whether it helped.
+                    let _ = chip.erase(at, at + SECTOR).await;
+                }
+                result => break result,
             }
-            full = true;
         };
         match result {
             Ok(()) => {
@@ -338,7 +337,7 @@ impl Storage {
     pub async fn clear_log_sector(&mut self, pace: Pace<'_>) -> Result<bool, ()> {
         // On from the last one, for a worn sector may never look blank.
         let from = core::mem::replace(&mut self.cleared, LOG.start);
-        let at = self.first_written(pace, from..LOG.end).await;
+        let at = self.first_written(from..LOG.end);
         if at >= LOG.end {
             self.log_full = false;
             return Ok(false);
@@ -353,6 +352,25 @@ impl Storage {
         self.cleared = at + SECTOR;
         Ok(true)
     }
+}
+
+/// The second sector of `region` that looks begun: marked at its begin and not at its end, as sequential-storage judges them. A
+/// queue has one and goes on with the sector behind it: that is the second, and its erase was cut off, so nothing else is lost
+/// with it. Without one the region's end, behind which nothing is kept.
+fn torn(chip: &mut Chip, region: Range<u32>) -> u32 {
+    let mut at = region.start;
+    let mut is_second = false;
+    let is_marked = |byte: u32| (byte & 0xFF).count_ones() <= 4;
+    while at < region.end {
+        if is_marked(chip.word(at) >> 24) && !is_marked(chip.word(at + SECTOR - 4)) {
+            if is_second {
+                break;
+            }
+            is_second = true;
+        }
+        at += SECTOR;
+    }
+    at
 }
 
 fn log(error: &Error<flash::Error<spi::Error>>) {

@@ -195,7 +195,7 @@ impl<'a> HostBoard<'a> {
             &history,
             self.external,
         );
-        if let Some(found) = tick.found {
+        while let Some(found) = self.measurement.take_found() {
             found.store(&mut self.configuration);
             self.measurement.configuration_changed(&self.configuration);
         }

@@ -174,6 +174,11 @@ impl Adc1 {
         self.parameters.die_temperature_c = die_temperature_c;
     }
 
+    /// Another noise of the code, as a standard deviation in codes.
+    pub const fn set_noise_codes(&mut self, noise_codes: f64) {
+        self.parameters.noise_codes = noise_codes;
+    }
+
     const fn is_on(&self) -> bool {
         self.cr2 & CR2_ADON != 0
     }

@@ -24,6 +24,9 @@ const CR_PLLRDY: u32 = 1 << 25;
 const CR_PLLI2SON: u32 = 1 << 26;
 const CR_DEFINED: u32 = 0x0F0F_FFFB;
 
+const CIR_CSSF: u32 = 1 << 7;
+const CIR_CSSC: u32 = 1 << 23;
+
 const PLLCFGR_RESET: u32 = 0x2400_3010;
 const PLLCFGR_DEFINED: u32 = 0x0F43_7FFF;
 /// Reserved, but set in the reset value: kept as written.
@@ -293,9 +296,9 @@ impl Oscillator {
 
 /// RCC.
 ///
-/// Not modelled: bypass, clock security, PLLI2S, spread spectrum, LSE and RTC, the clock outputs, interrupts, clocks
-/// that stop in sleep, a crystal that stops after it was ready, and tolerances of HSI and crystal (virtual time has
-/// whole ticks per period).
+/// Not modelled: bypass, PLLI2S, spread spectrum, LSE and RTC, the clock outputs, interrupts, clocks that stop in sleep, what a
+/// PLL does whose crystal stops without clock security (it goes on), and tolerances of HSI and crystal (virtual time
+/// has whole ticks per period).
 #[derive(Clone, Debug)]
 pub struct Rcc {
     parameters: RccParameters,
@@ -303,6 +306,10 @@ pub struct Rcc {
     hse: Oscillator,
     pll: Oscillator,
     lsi: Oscillator,
+    /// Clock security is on.
+    secured: bool,
+    /// It has found the crystal stopped: CSSF.
+    stopped: bool,
     pllcfgr: u32,
     /// SW and the prescalers.
     cfgr: u32,
@@ -333,6 +340,8 @@ impl Rcc {
             hse: Oscillator::OFF,
             pll: Oscillator::OFF,
             lsi: Oscillator::OFF,
+            secured: false,
+            stopped: false,
             pllcfgr: PLLCFGR_RESET,
             cfgr: 0,
             source: Source::Hsi,
@@ -352,6 +361,26 @@ impl Rcc {
     /// Whether the crystal swings the next time it is switched on.
     pub const fn set_crystal_swings(&mut self, swings: bool) {
         self.parameters.crystal_swings = swings;
+    }
+
+    /// The crystal stops, and does not swing until [`Rcc::set_crystal_swings`] lets it. Whether clock security raises NMI: it has
+    /// switched the crystal off, and where that fed the core, directly or through the PLL, HSI is in its place (RM0090, 7.2.7).
+    pub fn stop_crystal(&mut self, now: Ticks) -> bool {
+        self.parameters.crystal_swings = false;
+        if !self.secured || !self.hse.is_ready(now) {
+            return false;
+        }
+        self.hse = Oscillator::OFF;
+        if self.pll_source() == Source::Hse {
+            self.pll = Oscillator::OFF;
+        }
+        if self.source == Source::Hse || self.source == Source::Pll && !self.pll.on {
+            self.hsi.set(true, Some(now));
+            self.cfgr &= !CFGR_SW;
+        }
+        self.secured = false;
+        self.stopped = true;
+        true
     }
 
     /// The clocks as they are since the last write or event.
@@ -539,17 +568,22 @@ impl Rcc {
             | flag(CR_HSIRDY, self.hsi.is_ready(now))
             | flag(CR_HSEON, self.hse.on)
             | flag(CR_HSERDY, self.hse.is_ready(now))
+            | flag(CR_CSSON, self.secured)
             | flag(CR_PLLON, self.pll.on)
             | flag(CR_PLLRDY, self.pll.is_ready(now))
     }
 
     fn write_cr(&mut self, value: u32, now: Ticks) -> Result<(), Unmodelled> {
         only_bits("RCC_CR", value, CR_DEFINED)?;
-        refuse_bits("RCC_CR", value & (CR_HSEBYP | CR_CSSON | CR_PLLI2SON))?;
+        refuse_bits("RCC_CR", value & (CR_HSEBYP | CR_PLLI2SON))?;
         if value & CR_HSITRIM != CR_HSITRIM_RESET {
             return Err(unmodelled("RCC_CR", "HSITRIM other than 16"));
         }
         let on = |bit: u32| value & bit != 0;
+        // RM0090 lets it be set before, and hardware waits for HSERDY with it: nobody here does.
+        if on(CR_CSSON) && !self.hse.is_ready(now) {
+            return Err(unmodelled("RCC_CR", "CSSON before the crystal is ready"));
+        }
         let pll_on = on(CR_PLLON) || self.is_needed(Source::Pll);
         let kept = |source: Source, bit: u32| {
             let fed_pll_runs = self.pll.on && pll_on && self.pll_source() == source;
@@ -575,6 +609,7 @@ impl Rcc {
             }
         }
         self.pll.set(pll_on, Some(now + self.parameters.pll_lock));
+        self.secured = on(CR_CSSON);
         Ok(())
     }
 
@@ -665,8 +700,9 @@ impl Rcc {
                 };
                 self.cfgr | sws << 2
             }
-            // CIR: its flags come with interrupt enables only. BDCR: nothing of it is on. SSCGR: off.
-            0x0C | 0x70 | 0x80 => 0,
+            // CIR: its flags come with interrupt enables only, but for CSSF. BDCR: nothing of it is on. SSCGR: off.
+            0x0C => u32::from(self.stopped) << 7,
+            0x70 | 0x80 => 0,
             0x74 => {
                 let mut csr = self.flags;
                 if self.lsi.on {
@@ -727,8 +763,9 @@ impl Peripheral for Rcc {
             }
             0x08 => self.write_cfgr(value, now)?,
             0x0C => {
-                // The clear bits have nothing to clear.
-                only_bits("RCC_CIR", value, 0x00BF_0000)?;
+                // The clear bits have nothing to clear, but for CSSC.
+                only_bits("RCC_CIR", value & !CIR_CSSF, 0x00BF_0000)?;
+                self.stopped &= value & CIR_CSSC == 0;
             }
             0x70 => refuse_bits("RCC_BDCR", value)?,
             0x74 => {
@@ -941,6 +978,32 @@ mod tests {
     }
 
     #[test]
+    fn a_crystal_that_stops_is_replaced_where_it_is_watched() {
+        let (running, secured) = (0x0303_0083, 0x030B_0083);
+        let mut world = World::default();
+        let mut rcc = with_pll(&mut world);
+        run_from_pll(&mut world, &mut rcc);
+        world.write(&mut rcc, CR, 0x0101_0083 | CR_CSSON);
+        assert_eq!(world.read(&mut rcc, CR) & !0xFF00, secured);
+        assert!(rcc.stop_crystal(world.now));
+        world.run_until(&mut rcc, world.now + Ticks::from_micros(1));
+        assert_eq!(rcc.clocks().ahb, 16_000_000);
+        assert_eq!(world.read(&mut rcc, CR) & !0xFF00, 0x83);
+        assert_eq!(world.read(&mut rcc, CFGR) & 0xF, 0);
+        assert_eq!(world.read(&mut rcc, 0x0C), CIR_CSSF);
+        world.write(&mut rcc, 0x0C, CIR_CSSC);
+        assert_eq!(world.read(&mut rcc, 0x0C), 0);
+        // Once.
+        assert!(!rcc.stop_crystal(world.now));
+
+        let mut rcc = with_pll(&mut world);
+        run_from_pll(&mut world, &mut rcc);
+        assert!(!rcc.stop_crystal(world.now));
+        assert_eq!(world.read(&mut rcc, CR) & !0xFF00, running);
+        assert_eq!(world.read(&mut rcc, 0x0C), 0);
+    }
+
+    #[test]
     fn switch_waits_for_its_source() {
         let mut world = World::default();
         let mut rcc = Rcc::default();
@@ -995,9 +1058,11 @@ mod tests {
             world.refuses(&mut rcc, PLLCFGR, pllcfgr(4, 160, 2, 7, true)),
             "PLLCFGR while on"
         );
-        for bits in [CR_HSEBYP, CR_CSSON, CR_PLLI2SON] {
+        for bits in [CR_HSEBYP, CR_PLLI2SON] {
             assert!(world.refuses(&mut rcc, CR, 0x0101_0083 | bits));
         }
+        let mut off = Rcc::default();
+        assert!(world.refuses(&mut off, CR, 0x83 | CR_CSSON), "no crystal");
         assert!(world.refuses(&mut rcc, CFGR, 3));
         assert!(world.refuses(&mut rcc, CFGR, 1 << 21));
         assert!(world.refuses(&mut rcc, 0x0C, 1 << 12), "CIR");

@@ -172,6 +172,25 @@ fn fault_f13_repeated_samples_count_once_and_only_stuck_ones_are_called_so() {
     assert_eq!(rig.view.current_a().valid(), None);
 }
 
+/// Each move of the measured supply that gives the meter other factors makes the comparison begin anew: noise must not.
+#[test]
+fn fault_f13_a_stuck_converter_is_found_beside_a_noisy_supply() {
+    let rows = vec![row(0.0), row(5.0), row(7.0).with_current(40.0)];
+    let mut rig = rig_of(Setup::nominal(
+        Scenario::new(rows, Contactors::AlwaysClosed).unwrap(),
+    ));
+    rig.machine.adc(|adc| adc.set_noise_codes(1.0));
+    rig.run_s(5.0).unwrap();
+    assert_eq!(unexpected(&rig, &[]), Vec::<&str>::new());
+    strike(&mut rig, "F13:5s");
+    let found_s = until_diagnosis(&mut rig, "ConverterStuck", 3.0);
+    println!(
+        "F13 stuck while the current rises by 20 A/s, ADC1 with a code of noise: found after {:.0} ms",
+        found_s * 1e3
+    );
+    assert!(found_s <= 1.3, "{found_s}");
+}
+
 #[test]
 fn fault_f11_a_bus_error_that_is_none_costs_no_conversion() {
     let mut rig = steady(40.0);

@@ -278,6 +278,50 @@ fn fault_f24_the_board_is_back_after_a_hang_or_fault_with_its_charge_and_the_cau
 
 /// A chip that counts goes on through the reset of the microcontroller, also when the first look at it is disturbed: no
 /// self-test stops it, which would short its input by MODE for 100 ms.
+/// Clock security: nothing is measured, sent or permitted by a clock that is none.
+#[test]
+fn fault_f24_a_crystal_that_stops_ends_in_a_reset_with_its_cause() {
+    for is_back in [true, false] {
+        let mut rig = steady(40.0);
+        let before = charges_c(&mut rig);
+        rig.machine.stop_crystal();
+        rig.machine.clocks(|rcc, _| rcc.set_crystal_swings(is_back));
+        rig.view = Default::default();
+        rig.run_s(0.02).unwrap();
+        let causes: Vec<ResetCause> = rig
+            .machine
+            .resets()
+            .iter()
+            .map(|reset| reset.cause)
+            .collect();
+        assert_eq!(causes, [ResetCause::PowerOn, ResetCause::Software]);
+        assert_eq!(rig.view.last_at("Current"), None);
+        if !is_back {
+            // The watchdog's period, over and over, until it swings again.
+            rig.run_s(2.5).unwrap();
+            assert!(!board(&mut rig, |board| board.permits()));
+            assert_eq!(rig.view.last_at("Current"), None);
+            let last = rig.machine.resets().last().unwrap().cause;
+            assert_eq!(last, ResetCause::IndependentWatchdog);
+            rig.machine.clocks(|rcc, _| rcc.set_crystal_swings(true));
+        }
+        let back_s = until(&mut rig, "a valid current", 1.5, |rig| {
+            rig.view.current_a().valid().is_some()
+        });
+        let error_c = charge_error_c(&mut rig, before);
+        let said: Vec<&String> = rig
+            .log
+            .iter()
+            .filter(|line| line.contains("Exception"))
+            .collect();
+        println!(
+            "F24 crystal stopped, back at once {is_back}: valid after {back_s:.3} s, charge error {error_c:+.1} C, {said:?}"
+        );
+        // A start that waited for the crystal has taken the record of the one before; its stage tells.
+        assert_eq!(!said.is_empty(), is_back);
+    }
+}
+
 #[test]
 fn fault_f24_a_disturbed_first_look_at_the_meter_does_not_stop_it() {
     const MODE: u8 = 0x09;
