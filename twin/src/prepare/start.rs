@@ -271,10 +271,11 @@ fn follows(ah: &[f64], drive: &Drive, rows: Range<usize>, capacity_ah: f64) -> O
     // Of what flows to and fro, where it is farthest from the start.
     let mut flowed_ah = 0.0_f64;
     let (mut last, mut farthest) = ((0.0, rows.start), (0.0_f64, rows.start));
-    for row in rows.start + 1..rows.end {
+    let own = ah.iter().enumerate().take(rows.end).skip(rows.start + 1);
+    for (row, counted_ah) in own {
         flowed_ah += charge_ah(drive, row - 1..row + 1, 0.0, 1.0);
         last = (flowed_ah, row);
-        if flowed_ah.abs() > farthest.0.abs() && ah[row].is_finite() {
+        if flowed_ah.abs() > farthest.0.abs() && counted_ah.is_finite() {
             farthest = last;
         }
     }
