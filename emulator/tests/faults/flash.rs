@@ -231,7 +231,7 @@ fn fault_f19_a_cut_off_erase_does_not_end_the_saving() {
         .into_iter()
         .find(|(from, to, _)| to - from >= SECTOR as u64)
         .unwrap();
-    let mut torn = 0;
+    let (mut torn, mut failed) = (0, 0);
     for share in 0..12 {
         let bytes = erase + SECTOR as u64 * (8 + share) / 27;
         let mut rig = boot(flash.clone(), 0.0);
@@ -248,16 +248,21 @@ fn fault_f19_a_cut_off_erase_does_not_end_the_saving() {
             .filter(|sector| is_marked(sector * SECTOR) && !is_marked((sector + 1) * SECTOR - 1))
             .count();
         torn += usize::from(begun > 1);
-        for mah in [300_000, 400_000] {
-            set_capacity(&mut rig, mah);
-            save(&mut rig);
-        }
+        // A sector that looks blank and is not takes one save down with it, which says so: what is written is read back.
+        set_capacity(&mut rig, 300_000);
+        command(&mut rig, 7).unwrap();
+        rig.run_s(0.3).unwrap();
+        let first = input_registers(&mut rig, 0x0023, 1);
+        failed += usize::from(first != [2]);
+        assert!(first == [2] || was_raised(&rig, "FlashFault"), "{bytes}");
+        set_capacity(&mut rig, 400_000);
+        save(&mut rig);
         rig.power_cycle();
         rig.view = Default::default();
         started(&mut rig);
         assert_eq!(capacity(&mut rig), 400_000, "{bytes}");
     }
-    println!("F19 a cut-off erase: {torn} of 12 sectors looked begun");
+    println!("F19 a cut-off erase: {torn} of 12 sectors looked begun, {failed} first saves failed");
     assert!(torn >= 2, "{torn}");
 }
 

@@ -2,9 +2,7 @@
 
 use core_logic::error_budget::{hand_over_hidden, hand_over_latency};
 use core_logic::range::Range;
-use emulator::board::LineFault;
 use emulator::bus_view::validity;
-use emulator::time::Ticks;
 
 use crate::bench::*;
 
@@ -90,51 +88,6 @@ fn fault_f09_chatter_loses_no_edge_and_stays_within_the_declared_charge() {
         let expected = ["EdgeStorm", "RangeChatter", "FlagImplausible"];
         assert_eq!(unexpected(&rig, &expected), Vec::<&str>::new(), "{pattern}");
     }
-}
-
-/// Until the edge interrupt is held off by a task's lock for the `number`-th time from now.
-fn run_to_lock(rig: &mut emulator::rig::Rig<'_>, number: usize) {
-    // EXTI0 and its priority, 5 of RTIC's.
-    const EDGE: (u16, i32) = (16 + 6, (16 - 5) << 4);
-    let (mut seen, mut was_held) = (0, true);
-    while seen <= number {
-        let cpu = rig.machine.cpu();
-        let is_held = cpu.execution_priority() == EDGE.1 && cpu.current_exception() != EDGE.0;
-        seen += usize::from(is_held && !was_held);
-        was_held = is_held;
-        if seen <= number {
-            // An instruction; asleep a microsecond.
-            let step = Ticks(if cpu.is_asleep() {
-                Ticks::PER_MICROSECOND
-            } else {
-                1
-            });
-            let end = rig.machine.now() + step;
-            rig.machine.run_until(end).unwrap();
-        }
-    }
-}
-
-/// An edge is pending when the meter's task looks at the flag for edges that no interrupt told of: its handler counts it as well.
-#[test]
-fn fault_f09_an_edge_at_any_lock_counts_once() {
-    let mut rig = steady(0.0);
-    let (counted_before, _) = edges(&mut rig);
-    // A turn of 20 ms has them all.
-    let locks = 20;
-    for number in 0..locks {
-        run_to_lock(&mut rig, number);
-        board(&mut rig, |board| {
-            board.flag_fault = match board.flag_fault {
-                LineFault::None => LineFault::StuckHigh,
-                _ => LineFault::None,
-            };
-        });
-        rig.run_s(0.005).unwrap();
-    }
-    let (counted, coalesced) = edges(&mut rig);
-    println!("F9 at {locks} locks: counted {counted} and {coalesced} pairs");
-    assert_eq!((counted - counted_before, coalesced), (locks as u32, 0));
 }
 
 /// The most that the settings of the storm may let through: in windows of each length.
