@@ -295,7 +295,7 @@ impl Storage {
                     full = true;
                     let region = queue.flash_range();
                     let chip = queue.flash();
-                    let at = torn(&mut chip.0, region);
+                    let at = torn(chip.0, region);
                     // The next try tells whether it helped.
                     let _ = chip.erase(at, at + SECTOR).await;
                 }
