@@ -1190,6 +1190,7 @@ fn targets(summary: &Summary) -> Vec<Target> {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
     use serde_json::{Value, json};
