@@ -1602,7 +1602,7 @@ fn percent(taken: u16, of: u16) -> u16 {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
+#[allow(clippy::unwrap_used, clippy::cast_possible_truncation)]
 mod tests {
     use super::*;
 
@@ -1688,7 +1688,7 @@ mod tests {
                 sum + (state >> 11) as f64 / (1_u64 << 53) as f64
             })
         };
-        let (mut vdda_uv, mut changes, mut number) = (VDDA_UV, Vec::new(), 0);
+        let (mut vdda_uv, mut changes, mut number) = (VDDA_UV, std::vec::Vec::new(), 0);
         for tick in 0..60_000_u64 {
             if tick % 2 == 0 {
                 let reference = 1.21e6 / VDDA_UV * 4_096.0;
@@ -1702,7 +1702,8 @@ mod tests {
                 changes.push(tick);
             }
         }
-        let longest = changes.windows(2).map(|pair| pair[1] - pair[0]).max();
+        let later = changes.iter().skip(1);
+        let longest = changes.iter().zip(later).map(|(from, to)| to - from).max();
         let used = measurement.prepared.supply.unwrap();
         assert!(changes.len() < 40, "{} in 10 min", changes.len());
         assert!(longest > Some(6_000), "{longest:?} ticks");
