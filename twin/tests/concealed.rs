@@ -465,30 +465,6 @@ fn a_curve_of_another_shape_is_unknown() {
     }
 }
 
-/// Where names are taken back, what is left is the mismatch, and so is the share of it that the inputs could explain.
-#[test]
-fn what_is_left_without_names_is_the_mismatch() {
-    let truth = truth();
-    let reading: Vec<f64> = truth.current_a.iter().map(|i| i + 2e-4 * i * i).collect();
-    let report = explained(&truth, reading.clone(), 20, &[]);
-    let taken_back = |text: &String| text.contains("the true physics is likely another");
-    assert!(
-        report.decisions.iter().any(taken_back),
-        "{:?}",
-        report.decisions
-    );
-    let library = twin::effects::ids();
-    let nothing = explained(&truth, reading, 20, &library);
-    let [share, of_all] = [&report, &nothing].map(|report| {
-        let [left] = report.unexplained.as_slice() else {
-            panic!("{:?}", report.unexplained);
-        };
-        left.explainable_share
-    });
-    assert_eq!(share, of_all);
-    assert!(share > 0.5, "{share}");
-}
-
 /// A drive of a fifth of the size.
 fn gentle() -> Truth {
     let mut truth = truth();
