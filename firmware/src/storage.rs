@@ -290,15 +290,6 @@ impl Storage {
         let result = loop {
             match queue.push(record, full).await {
                 Err(Error::FullStorage) if !full => full = true,
-                // Its own repair passes over a sector that a cut-off erase has left with its begin marked and its end not.
-                Err(Error::Corrupted {}) if !full => {
-                    full = true;
-                    let region = queue.flash_range();
-                    let chip = queue.flash();
-                    let at = torn(chip.0, region);
-                    // The next try tells whether it helped.
-                    let _ = chip.erase(at, at + SECTOR).await;
-                }
                 result => break result,
             }
         };
@@ -352,25 +343,6 @@ impl Storage {
         self.cleared = at + SECTOR;
         Ok(true)
     }
-}
-
-/// The second sector of `region` that looks begun: marked at its begin and not at its end, as sequential-storage judges them. A
-/// queue has one and goes on with the sector behind it: that is the second, and its erase was cut off, so nothing else is lost
-/// with it. Without one the region's end, behind which nothing is kept.
-fn torn(chip: &mut Chip, region: Range<u32>) -> u32 {
-    let mut at = region.start;
-    let mut is_second = false;
-    let is_marked = |byte: u32| (byte & 0xFF).count_ones() <= 4;
-    while at < region.end {
-        if is_marked(chip.word(at) >> 24) && !is_marked(chip.word(at + SECTOR - 4)) {
-            if is_second {
-                break;
-            }
-            is_second = true;
-        }
-        at += SECTOR;
-    }
-    at
 }
 
 fn log(error: &Error<flash::Error<spi::Error>>) {

@@ -219,53 +219,6 @@ fn before_an_erase() -> Vec<u8> {
     panic!("no save erases");
 }
 
-/// The queue takes a sector whose erase was cut off so that its begin is still marked and its end is not for one that it writes
-/// into, and would not go on to it.
-#[test]
-fn fault_f19_a_cut_off_erase_does_not_end_the_saving() {
-    let flash = before_an_erase();
-    let mut rig = boot(flash.clone(), 0.0);
-    started(&mut rig);
-    command(&mut rig, 7).unwrap();
-    let (erase, _, _) = operations(&mut rig, 0.25)
-        .into_iter()
-        .find(|(from, to, _)| to - from >= SECTOR as u64)
-        .unwrap();
-    let (mut torn, mut failed) = (0, 0);
-    for share in 0..12 {
-        let bytes = erase + SECTOR as u64 * (8 + share) / 27;
-        let mut rig = boot(flash.clone(), 0.0);
-        started(&mut rig);
-        set_capacity(&mut rig, 200_000);
-        board(&mut rig, |board| board.flash.shut_off_after(bytes));
-        command(&mut rig, 7).unwrap();
-        assert!(cut_off(&mut rig, 0.25));
-        started(&mut rig);
-        assert_eq!(capacity(&mut rig), 100_000);
-        let flash = content(&mut rig);
-        let is_marked = |at: usize| flash[at].count_zeros() >= 4;
-        let begun = CONFIGURATION_SECTORS
-            .filter(|sector| is_marked(sector * SECTOR) && !is_marked((sector + 1) * SECTOR - 1))
-            .count();
-        torn += usize::from(begun > 1);
-        // A sector that looks blank and is not takes one save down with it, which says so: what is written is read back.
-        set_capacity(&mut rig, 300_000);
-        command(&mut rig, 7).unwrap();
-        rig.run_s(0.3).unwrap();
-        let first = input_registers(&mut rig, 0x0023, 1);
-        failed += usize::from(first != [2]);
-        assert!(first == [2] || was_raised(&rig, "FlashFault"), "{bytes}");
-        set_capacity(&mut rig, 400_000);
-        save(&mut rig);
-        rig.power_cycle();
-        rig.view = Default::default();
-        started(&mut rig);
-        assert_eq!(capacity(&mut rig), 400_000, "{bytes}");
-    }
-    println!("F19 a cut-off erase: {torn} of 12 sectors looked begun, {failed} first saves failed");
-    assert!(torn >= 2, "{torn}");
-}
-
 /// What a busy chip is told it ignores, though the latch of the erase under way reads as a write enabled.
 #[test]
 fn fault_f20_nothing_is_written_while_an_erase_runs_on() {
