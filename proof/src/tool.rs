@@ -218,14 +218,12 @@ impl Tool {
         let mut simulated = Vec::new();
         for (model, out) in [(designed, "designed.csv"), (found, "found.csv")] {
             let mut command = self.command(kept);
-            command.arg("simulate").arg("--model").arg(model).args([
-                "--recording",
-                drive,
-                "--out",
-                out,
-                // The squares of what is held out are those of one rounding, as today's methods have it.
-                "--no-step",
-            ]);
+            // The squares of what is held out are those of one rounding, as today's methods have it.
+            command.args(["simulate", "--no-step"]);
+            command
+                .arg("--model")
+                .arg(model)
+                .args(["--recording", drive, "--out", out]);
             if two_clocks {
                 command.args(["--reference", "holdout-reference.csv"]);
             }
