@@ -19,11 +19,8 @@ const AT_REST_V: f64 = 0.010;
 const OF_READING: f64 = 0.005;
 /// No reading is worth less than this uncertainty, 0 … 1: where the open-circuit voltage is flat it tells nothing.
 const WORTH: f64 = 0.3;
-/// A tester's counter is believed over a gap if it has followed the current within this share of the capacity before, over more than that.
+/// A tester's counter is believed over a gap if it has followed the current within this share of the capacity before.
 const COUNTER_SHARE: f64 = 0.02;
-/// Readings on both sides of a gap may say something else than a counter does by this share of its charge: a worn cell has lost as much of
-/// its capacity.
-const WORN: f64 = 0.3;
 /// A gap that leaves less than this of the state of charge open, 0 … 1, leaves nothing open: where a voltage is as steep as 1 V from full to
 /// empty it is a tenth of a millivolt.
 const OPEN: f64 = 1e-4;
@@ -63,29 +60,20 @@ pub(super) fn find(
     let mut end = 1.0;
     let mut bridged = 0;
     let mut open: Vec<f64> = Vec::new();
-    // Whether the counter followed the current when that last told.
-    let mut followed = false;
     for (index, own) in drive.segments.iter().enumerate() {
         let mut excess_ah = 0.0;
         let mut gap_sigma = 0.0;
         let first = if drive.is_continued(index) {
             let gap_s = drive.t_s[own.start] - drive.t_s[own.start - 1];
-            // The counter is beside the current as it was recorded; through the battery flows what is left of that without its zero.
-            let recorded_a = [drive.reference[own.start - 1], drive.reference[own.start]];
-            let ends_a = recorded_a.map(|end_a| end_a - base.current_zero_a);
-            let left_ah = |excess_ah| gap_ah(ends_a, gap_s, excess_ah, battery.efficiency);
-            let line = end - left_ah(0.0) / battery.capacity_ah;
-            let line_ah = gap_ah(recorded_a, gap_s, 0.0, 1.0);
+            let ends_a = [drive.reference[own.start - 1], drive.reference[own.start]];
+            let before = &drive.segments[index - 1];
             let counted = readings
                 .counter_ah
-                .filter(|_| followed)
-                .and_then(|ah| over_gap(ah, own.start, line_ah, battery.capacity_ah))
-                .filter(|counted_ah| {
-                    let lost = left_ah(counted_ah - line_ah) / battery.capacity_ah;
-                    contradicted(base, readings, index, -lost) <= WORN * lost.abs()
-                });
+                .and_then(|ah| over_gap(ah, drive, before.clone(), own.start, battery.capacity_ah));
+            let left_ah = |excess_ah| gap_ah(ends_a, gap_s, excess_ah, battery.efficiency);
+            let line = end - left_ah(0.0) / battery.capacity_ah;
             match counted {
-                Some(counted_ah) => excess_ah = counted_ah - line_ah,
+                Some(ah) => excess_ah = ah - gap_ah(ends_a, gap_s, 0.0, 1.0),
                 None => {
                     let sigma = gap_s * line_sigma_a(drive, index) / 3600.0 / battery.capacity_ah;
                     let sigma = sigma.max(contradicted(base, readings, index, line - end));
@@ -111,17 +99,12 @@ pub(super) fn find(
         } else {
             let (first, sigma) = begun(work, base, readings, battery, index);
             base.initial_soc_sigma.push(sigma);
-            followed = false;
             first
         };
-        let told = readings
-            .counter_ah
-            .and_then(|ah| follows(ah, drive, own.clone(), battery.capacity_ah));
-        followed = told.unwrap_or(followed);
         base.initial_soc.push(first);
         base.gap_excess_ah.push(excess_ah);
         base.gap_soc_sigma.push(gap_sigma);
-        end = first - flowed(base, drive, own.clone());
+        end = first - charge_ah(drive, own.clone(), battery.efficiency) / battery.capacity_ah;
     }
     if bridged > 0 {
         work.remark(format!(
@@ -194,14 +177,6 @@ fn begun(
         seen(base, readings, index)
     };
     let told = |(soc, sigma): Soc| format!("{:.1} % ± {:.1} %", 100.0 * soc, 100.0 * sigma);
-    // Stated, it is so of the first operation alone.
-    let of_other = battery
-        .initial_soc
-        .map(|_| format!("of operation {}", readings.clocks[index] + 1));
-    let not_stated = match &of_other {
-        Some(_) => "initial_soc is said of the first operation",
-        None => "initial_soc is not stated",
-    };
     match (stated, seen) {
         (Some(stated), None) => stated,
         // What is stated is said of the fitted recording: another one may begin there too, but need not.
@@ -219,21 +194,19 @@ fn begun(
         }
         (None, Some(seen)) => {
             work.remark(format!(
-                "{not_stated}: {} taken from the first reading of {name}{}",
+                "initial_soc is not stated: {} taken from the first reading of {name}{}",
                 told(seen),
-                match of_other {
-                    Some(of_other) => format!(" {of_other}"),
-                    None if index == 0 => String::new(),
-                    None => format!(" of stretch {}", index + 1),
+                if index == 0 {
+                    String::new()
+                } else {
+                    format!(" of stretch {}", index + 1)
                 }
             ));
             (seen.0, sigma.max(seen.1))
         }
         (None, None) => {
-            let that =
-                of_other.map_or_else(|| "it".to_owned(), |of_other| format!("that {of_other}"));
             work.remark(format!(
-                "{not_stated} and {name} does not tell {that}: a full battery is assumed"
+                "initial_soc is not stated and {name} does not tell it: a full battery is assumed"
             ));
             (1.0, 1.0)
         }
@@ -251,45 +224,31 @@ fn weighted(one: Soc, other: Soc) -> f64 {
     }
 }
 
-/// Ah over rows of a segment of a current that reads `zero_a` without one, charging times the efficiency.
-fn charge_ah(drive: &Drive, rows: Range<usize>, zero_a: f64, efficiency: f64) -> f64 {
+/// Ah over a segment, charging times the efficiency.
+fn charge_ah(drive: &Drive, rows: Range<usize>, efficiency: f64) -> f64 {
     let mut charge = 0.0;
     for row in rows.start + 1..rows.end {
-        let ends = drive.ends(row, [drive.reference[row - 1], drive.reference[row]]);
-        let [from, to] = ends.map(|end_a| end_a - zero_a);
+        let [from, to] = drive.ends(row, [drive.reference[row - 1], drive.reference[row]]);
         let mean_a = mean_flow(from, to, efficiency);
         charge += mean_a * (drive.t_s[row] - drive.t_s[row - 1]);
     }
     charge / 3600.0
 }
 
-/// Whether a tester's counter follows the current over a segment; `None` where so little flows that one which stands would, too.
-fn follows(ah: &[f64], drive: &Drive, rows: Range<usize>, capacity_ah: f64) -> Option<bool> {
-    let within_ah = COUNTER_SHARE * capacity_ah;
-    let is_near =
-        |(flowed_ah, row): (f64, usize)| (ah[row] - ah[rows.start] - flowed_ah).abs() <= within_ah;
-    // Of what flows to and fro, where it is farthest from the start.
-    let mut flowed_ah = 0.0_f64;
-    let (mut last, mut farthest) = ((0.0, rows.start), (0.0_f64, rows.start));
-    let own = ah.iter().enumerate().take(rows.end).skip(rows.start + 1);
-    for (row, counted_ah) in own {
-        flowed_ah += charge_ah(drive, row - 1..row + 1, 0.0, 1.0);
-        last = (flowed_ah, row);
-        if flowed_ah.abs() > farthest.0.abs() && counted_ah.is_finite() {
-            farthest = last;
-        }
-    }
-    let follows = is_near(last) && is_near(farthest);
-    (!follows || farthest.0.abs() > within_ah).then_some(follows)
-}
-
-/// What a tester's counter says of the gap before a row, in Ah, unless it was set anew there: by itself it then says what a straight line
-/// does, `line_ah`, and the difference does not.
-fn over_gap(ah: &[f64], after: usize, line_ah: f64, capacity_ah: f64) -> Option<f64> {
-    let over_ah = ah[after] - ah[after - 1];
-    let as_the_line = |ah: f64| (ah - line_ah).abs() <= COUNTER_SHARE * capacity_ah;
-    let is_reset = as_the_line(ah[after]) && !as_the_line(over_ah);
-    (!is_reset && over_ah.abs() <= capacity_ah).then_some(over_ah)
+/// What a tester's counter says of a gap, if it followed the current before.
+fn over_gap(
+    ah: &[f64],
+    drive: &Drive,
+    before: Range<usize>,
+    after: usize,
+    capacity_ah: f64,
+) -> Option<f64> {
+    let last = before.end - 1;
+    let counted = ah[last] - ah[before.start];
+    let flowed = charge_ah(drive, before, 1.0);
+    let over = ah[after] - ah[last];
+    let follows = (counted - flowed).abs() <= COUNTER_SHARE * capacity_ah;
+    (follows && over.is_finite() && over.abs() <= capacity_ah).then_some(over)
 }
 
 /// How far the mean current over the gap before a segment may be from that of a straight line between its ends, in A, as a standard
@@ -339,25 +298,26 @@ fn contradicted(base: &BatteryBase, readings: &Readings<'_>, segment: usize, lin
     }
 }
 
-/// State of charge at the start of a segment from its first reading, and what flowed until then.
+/// State of charge at the start of a segment from its first reading.
 fn seen(base: &BatteryBase, readings: &Readings<'_>, segment: usize) -> Option<Soc> {
-    let first = read_rows(readings.observed, segment).next()?;
-    let ((soc, sigma), at) = seen_at(base, readings, first)?;
-    let until = readings.drive.segments[segment].start..at + 1;
-    Some((soc + flowed(base, readings.drive, until), sigma))
+    let drive_row = readings.drive.segments[segment].start;
+    seen_at(
+        base,
+        readings,
+        drive_row,
+        read_rows(readings.observed, segment).next()?,
+    )
 }
 
 /// The same at its end from its last one.
 fn last_seen(base: &BatteryBase, readings: &Readings<'_>, segment: usize) -> Option<Soc> {
-    let last = read_rows(readings.observed, segment).last()?;
-    let ((soc, sigma), at) = seen_at(base, readings, last)?;
-    let since = at..readings.drive.segments[segment].end;
-    Some((soc - flowed(base, readings.drive, since), sigma))
-}
-
-/// State of charge, 0 … 1, that a battery loses over some rows of a segment.
-fn flowed(base: &BatteryBase, drive: &Drive, rows: Range<usize>) -> f64 {
-    charge_ah(drive, rows, base.current_zero_a, base.efficiency) / base.capacity_ah
+    let drive_row = readings.drive.segments[segment].end - 1;
+    seen_at(
+        base,
+        readings,
+        drive_row,
+        read_rows(readings.observed, segment).last()?,
+    )
 }
 
 /// Rows of a segment that were read.
@@ -369,28 +329,28 @@ fn read_rows(observed: &Observed, segment: usize) -> impl Iterator<Item = usize>
     rows.filter(|row| observed.valid[*row] && observed.value[*row].is_finite())
 }
 
-/// State of charge from a reading, by the current then, and the drive's row of that.
-fn seen_at(base: &BatteryBase, readings: &Readings<'_>, row: usize) -> Option<(Soc, usize)> {
+/// State of charge from a reading, by the current at a row of the drive.
+fn seen_at(
+    base: &BatteryBase,
+    readings: &Readings<'_>,
+    drive_row: usize,
+    row: usize,
+) -> Option<Soc> {
     let (drive, observed) = (readings.drive, readings.observed);
-    let drive_row = observed.drive_row_before(drive, row)?;
     let value = observed.value[row];
     // Noise of that one reading, and what rounding takes of it.
     let noise = readings.noise.hypot(observed.grid / 12f64.sqrt());
     if readings.view == View::StateOfCharge {
-        let soc = (value / 100.0, OF_READING.hypot(noise / 100.0));
-        return Some((soc, drive_row));
+        return Some((value / 100.0, OF_READING.hypot(noise / 100.0)));
     }
-    let current_a = drive.reference[drive_row] - base.current_zero_a;
+    let current_a = drive.reference[drive_row];
     let rest_v = base.cells * AT_REST_V;
     let there = inverse(&base.ocv, value + base.resistance_ohm * current_a, rest_v)?;
     // A voltage under load says little.
     let loaded_v = 0.5 * base.resistance_ohm * current_a.abs();
     let within_v = (rest_v + loaded_v).hypot(noise);
     let within_v = within_v.hypot(there.bend_v);
-    Some((
-        (there.soc, (within_v / there.slope_v).min(WORTH)),
-        drive_row,
-    ))
+    Some((there.soc, (within_v / there.slope_v).min(WORTH)))
 }
 
 /// Where an open-circuit voltage is on the table.
