@@ -139,15 +139,6 @@ impl<SPI: SpiDevice> Flash<SPI> {
         Ok(())
     }
 
-    /// Four bytes, the first as the highest; 0 where they cannot be read. 5 µs.
-    pub fn word(&mut self, at: u32) -> u32 {
-        let mut word = [0; 4];
-        match self.transfer(&command(READ, at), &mut word) {
-            Ok(()) => u32::from_be_bytes(word),
-            Err(_) => 0,
-        }
-    }
-
     fn enable_write(&mut self) -> Result<(), Error<SPI::Error>> {
         self.0.write(&[WRITE_ENABLE]).map_err(Error::Bus)?;
         // An erase keeps the latch set for as long as it runs, and what is written meanwhile is ignored.

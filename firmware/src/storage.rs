@@ -18,7 +18,7 @@ use core_logic::{
     configuration::{self, Configuration, ConfigurationError, MAX_RECORD},
     retained::{LogRecord, MAX_LOG_BYTES, MAX_STATE_BYTES, RetainedState},
 };
-use embedded_storage_async::nor_flash::NorFlash;
+use embedded_storage_async::nor_flash::{NorFlash, ReadNorFlash};
 use sequential_storage::{
     Error,
     cache::Cache,
@@ -216,7 +216,7 @@ impl Storage {
         }
         // Nothing intact in a region that is not blank: there was a record once, and it is damaged.
         let end = region.end;
-        if length.is_none() && self.first_written(region) < end {
+        if length.is_none() && self.first_written(pace, region).await < end {
             count(&mut self.counters.refused);
             self.failed = true;
             return Err(());
@@ -235,9 +235,18 @@ impl Storage {
     }
 
     /// The region's first sector that was written, or cannot be read; its end without one.
-    fn first_written(&mut self, region: Range<u32>) -> u32 {
+    async fn first_written(&mut self, pace: Pace<'_>, region: Range<u32>) -> u32 {
         let mut at = region.start;
-        while at < region.end && self.flash.word(at) == u32::MAX {
+        while at < region.end {
+            let mut mark = [0; 4];
+            if Lent(&mut self.flash, pace)
+                .read(at, &mut mark)
+                .await
+                .is_err()
+                || mark != [0xFF; 4]
+            {
+                break;
+            }
             at += SECTOR;
         }
         at
@@ -288,10 +297,11 @@ impl Storage {
             QueueStorage::new(Lent(&mut self.flash, pace), config, Cache::new_uncached());
         let mut full = false;
         let result = loop {
-            match queue.push(record, full).await {
-                Err(Error::FullStorage) if !full => full = true,
-                result => break result,
+            let result = queue.push(record, full).await;
+            if full || !matches!(result, Err(Error::FullStorage)) {
+                break result;
             }
+            full = true;
         };
         match result {
             Ok(()) => {
@@ -328,7 +338,7 @@ impl Storage {
     pub async fn clear_log_sector(&mut self, pace: Pace<'_>) -> Result<bool, ()> {
         // On from the last one, for a worn sector may never look blank.
         let from = core::mem::replace(&mut self.cleared, LOG.start);
-        let at = self.first_written(from..LOG.end);
+        let at = self.first_written(pace, from..LOG.end).await;
         if at >= LOG.end {
             self.log_full = false;
             return Ok(false);

@@ -447,20 +447,20 @@ fn in_short(text: &mut String, summary: &Summary) {
             target.found
         );
     }
-    let better = summary
+    let over_ideal = summary
         .board
         .iter()
         .filter_map(|line| line.calibrated.as_ref())
         .filter(|one| one.after_a < one.before_a)
         .map(|one| one.after_a / one.ideal_a)
         .collect::<Vec<f64>>();
-    let worst = better.iter().copied().fold(0.0, f64::max);
+    let worst = over_ideal.iter().copied().fold(0.0, f64::max);
     if !summary.board.is_empty() {
         let _ = writeln!(
             text,
             "- Emulated board: {} of {} concealed sensor errors were made smaller on another drive by writing the tool's calibration back, \
              to at most {worst:.2} times the error of a board without any.",
-            better.len(),
+            over_ideal.len(),
             summary.board.len()
         );
     }

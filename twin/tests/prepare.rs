@@ -284,6 +284,55 @@ fn rows_of_their_own_are_not_interpolated() {
 }
 
 #[test]
+fn a_held_value_counts_once_on_rows_of_its_own() {
+    // As a bus delivers them: measured each 0.1 s, sent each 0.02 s, the reference between.
+    let rows = (0..2000).map(|k| {
+        let t = f64::from(k) * 0.01;
+        if k % 2 == 0 {
+            vec![t, current(t), f64::NAN]
+        } else {
+            vec![t, f64::NAN, current(f64::from(k / 10) * 0.1)]
+        }
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    assert!(!problem.observed.on_drive_rows());
+    let fresh = problem.observed.valid_rows();
+    assert!((198..=202).contains(&fresh), "{fresh}");
+    assert!(remarks[0].contains("100.000 ms"), "{remarks:?}");
+    // A reference that comes each second does not jump there: readings in steps between two of its rows are new.
+    let rows = (0..2000).map(|k| {
+        let t = f64::from(k) * 0.1;
+        if k % 10 == 0 {
+            vec![t, current(0.1 * t), f64::NAN]
+        } else {
+            vec![t, f64::NAN, (current(0.1 * t) / 0.4).round() * 0.4]
+        }
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    let fresh = problem.observed.valid_rows();
+    assert!(fresh > 1780, "{fresh} {remarks:?}");
+}
+
+#[test]
+fn a_dead_sensor_is_not_in_another_unit() {
+    let folder = tempfile::tempdir().unwrap();
+    let rows = (0..400).map(|k| {
+        let t = f64::from(k) * 0.1;
+        let noise = 0.05 * (12.9898 * f64::from(k * k % 977)).sin();
+        vec![t, 4.0 * current(t), noise]
+    });
+    let recording = text("t_s,i_ref_a,i_meas_a", rows);
+    let prepared = read(folder.path(), PAIR, &recording, &[]).unwrap();
+    let remarks = prepared.remarks;
+    assert!(
+        remarks
+            .iter()
+            .any(|remark| remark.contains("the sensor may be dead")),
+        "{remarks:?}"
+    );
+}
+
+#[test]
 fn a_minus_turns_the_sign() {
     let folder = tempfile::tempdir().unwrap();
     let rows = (0..200).map(|k| {
@@ -520,6 +569,40 @@ fn the_state_of_charge_goes_on_over_a_gap() {
             .any(|remark| remark.contains("straight line")),
         "{remarks:?}"
     );
+}
+
+/// A cell of `BATTERY` from 90 % on, through currents in A for so many seconds each: time, current and voltage of each second.
+fn cell(steps: &[(usize, f64)]) -> Vec<Vec<f64>> {
+    let each = steps.iter();
+    let currents: Vec<f64> = each
+        .flat_map(|(length_s, current_a)| vec![*current_a; *length_s])
+        .collect();
+    let mut soc = 0.9;
+    let mut before_a = currents[0];
+    let rows = currents.iter().enumerate();
+    rows.map(|(k, current_a)| {
+        if k > 0 {
+            soc -= 0.5 * (before_a + current_a) / 3600.0;
+        }
+        before_a = *current_a;
+        vec![k as f64, *current_a, 3.0 + soc - 0.01 * current_a]
+    })
+    .collect()
+}
+
+#[test]
+fn what_goes_by_the_resistance_needs_one() {
+    let recording = text(
+        "t_s,i_ref_a,v_cell_v",
+        cell(&[(300, 0.5), (300, 1.0)]).into_iter(),
+    );
+    let lacks = |model: &str| {
+        let (_, remarks) = one(model, &recording);
+        let says = |remark: &String| remark.contains("no ohmic_resistance_ohm: resistance");
+        remarks.iter().any(says)
+    };
+    assert!(!lacks(BATTERY));
+    assert!(lacks(&BATTERY.replace("ohmic_resistance_ohm = 0.01\n", "")));
 }
 
 #[test]
