@@ -18,7 +18,7 @@ use core_logic::{
     configuration::{self, Configuration, ConfigurationError, MAX_RECORD},
     retained::{LogRecord, MAX_LOG_BYTES, MAX_STATE_BYTES, RetainedState},
 };
-use embedded_storage_async::nor_flash::{NorFlash, ReadNorFlash};
+use embedded_storage_async::nor_flash::NorFlash;
 use sequential_storage::{
     Error,
     cache::Cache,
@@ -130,14 +130,39 @@ impl Storage {
         )
     }
 
-    /// One try to wake the chip; whether it answers. Without it nothing is read or written: one that has gone reads as blank.
+    /// One try to wake the chip, and to end what a loss of power has cut off in it; whether it answers. Without it nothing is
+    /// read or written: one that has gone reads as blank.
     pub async fn start(&mut self, pace: Pace<'_>) -> bool {
-        let result = self.flash.start(pace).await;
+        let mut result = self.flash.start(pace).await;
+        for region in &[CONFIGURATION, STATE, LOG] {
+            if result.is_err() || self.ready {
+                break;
+            }
+            let at = self.torn(region);
+            if at < region.end {
+                result = Lent(&mut self.flash, pace).erase(at, at + SECTOR).await;
+            }
+        }
         if let Err(error) = &result {
             defmt::debug!("flash: {}", error);
         }
         self.ready = result.is_ok();
         self.ready
+    }
+
+    /// The sector whose erase was cut off, if it has left one that looks begun behind another one: the queue erases only
+    /// the sector next to the one that it writes into, the first after the last, and has begun no other. It would not go on to
+    /// that sector, or take what is left in it for the newest records.
+    #[inline(never)]
+    fn torn(&mut self, region: &Range<u32>) -> u32 {
+        let mut behind = region.end;
+        let mut at = region.start;
+        while at < region.end && !(self.flash.is_begun(at) && self.flash.is_begun(behind - SECTOR))
+        {
+            at += SECTOR;
+            behind = at;
+        }
+        at
     }
 
     /// Whether the chip has answered.
@@ -216,7 +241,7 @@ impl Storage {
         }
         // Nothing intact in a region that is not blank: there was a record once, and it is damaged.
         let end = region.end;
-        if length.is_none() && self.first_written(pace, region).await < end {
+        if length.is_none() && self.first_written(region) < end {
             count(&mut self.counters.refused);
             self.failed = true;
             return Err(());
@@ -235,18 +260,9 @@ impl Storage {
     }
 
     /// The region's first sector that was written, or cannot be read; its end without one.
-    async fn first_written(&mut self, pace: Pace<'_>, region: Range<u32>) -> u32 {
+    fn first_written(&mut self, region: Range<u32>) -> u32 {
         let mut at = region.start;
-        while at < region.end {
-            let mut mark = [0; 4];
-            if Lent(&mut self.flash, pace)
-                .read(at, &mut mark)
-                .await
-                .is_err()
-                || mark != [0xFF; 4]
-            {
-                break;
-            }
+        while at < region.end && self.flash.word(at) == u32::MAX {
             at += SECTOR;
         }
         at
@@ -309,12 +325,16 @@ impl Storage {
                 Ok(full)
             }
             Err(error) => {
-                log(&error);
-                count(&mut self.counters.failures);
-                self.failed = true;
+                self.has_failed(&error);
                 Err(())
             }
         }
+    }
+
+    fn has_failed(&mut self, error: &Error<flash::Error<spi::Error>>) {
+        log(error);
+        count(&mut self.counters.failures);
+        self.failed = true;
     }
 
     /// Appends to the log, over its oldest records when it is full.
@@ -338,15 +358,13 @@ impl Storage {
     pub async fn clear_log_sector(&mut self, pace: Pace<'_>) -> Result<bool, ()> {
         // On from the last one, for a worn sector may never look blank.
         let from = core::mem::replace(&mut self.cleared, LOG.start);
-        let at = self.first_written(pace, from..LOG.end).await;
+        let at = self.first_written(from..LOG.end);
         if at >= LOG.end {
             self.log_full = false;
             return Ok(false);
         }
-        if let Err(error) = Lent(&mut self.flash, pace).erase(at, at + SECTOR).await {
-            defmt::error!("flash: {}", error);
-            count(&mut self.counters.failures);
-            self.failed = true;
+        if let Err(value) = Lent(&mut self.flash, pace).erase(at, at + SECTOR).await {
+            self.has_failed(&Error::Storage { value });
             return Err(());
         }
         count(&mut self.counters.erased);
