@@ -168,7 +168,7 @@ diagnoses! {
         0 ms, 1000 ms, Warning, WhileActive, [] [] []
     17 EdgeStorm: "The range-flag or meter interrupt is masked: too many edges.",
         "events per window (`StormConfig`)";
-        0 ms, 1000 ms, Warning, WhileActive, [] [IMPLAUSIBLE] []
+        0 ms, 1000 ms, Warning, WhileActive, [] [] []
     18 SupplyOutOfRange: "The sensors' supply is outside its limits, or not measured.",
         "4.5 … 5.5 V (`SENSOR_SUPPLY_LOW`, `SENSOR_SUPPLY_HIGH`)";
         20 ms, 200 ms, Error, WhileActive, [SUPPLY] [SUPPLY] [SUPPLY]

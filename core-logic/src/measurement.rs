@@ -554,6 +554,12 @@ impl Measurement {
         }
         self.converter
             .reconfigured(&converter, &self.prepared.converter, self.now);
+        if converter.channel() != self.prepared.converter.channel() {
+            // What was found with the other front end would stand: nothing judges it with this one.
+            self.converter_fault = None;
+            self.open_sensor = OpenSensor::new();
+            self.flag = self.flag_plausibility.rest();
+        }
         if before.capacity() != self.prepared.soc.capacity() {
             self.soc.change_capacity(&before, &self.prepared.soc);
         }
@@ -834,6 +840,10 @@ impl Measurement {
         if let Some(refusal) = self.zero.tick(&configuration.zero_drift, now) {
             self.fail(refusal.into());
         }
+        if !self.is_at_rest() {
+            // A sweep that was begun and left would keep the current invalid for all of the drive.
+            self.sweep = None;
+        }
         let conditions = self.conditions(configuration).union(external);
         let changes = self.diagnosis.step(now, conditions);
         self.effects = self.diagnosis.effects();
@@ -917,7 +927,7 @@ impl Measurement {
                 if !configuration.key_calibration.enabled {
                     return Err(Refusal::Disabled);
                 }
-                if !self.high_voltage_is_off() || self.key_outputs.hv_permit {
+                if !self.is_at_rest() {
                     return Err(Refusal::HighVoltage);
                 }
                 // VC1 is taken with key OFF only: begun in ACC it could but fail.
@@ -957,6 +967,8 @@ impl Measurement {
             }
             Order::ClearDiagnoses => {
                 self.diagnosis.clear();
+                // It may have been mended by hand, and no zero can be taken while high voltage is on.
+                self.zero_beyond_limit = false;
                 Ok(CommandState::Done)
             }
         }
@@ -1086,13 +1098,13 @@ impl Measurement {
         let unusable = Validity::RANGE_CHANGE
             .and(Validity::CHIP_FAULT)
             .and(Validity::STALE);
-        if !configuration.front_end.has_two_ranges()
-            || self.reading.validity.bits() & unusable.bits() != 0
-        {
+        if self.reading.validity.bits() & unusable.bits() != 0 {
             return;
         }
-        if self.open_sensor.finding(Range::Small).is_fault() {
-            // The large sensor is in use whatever the current, and rightly so.
+        // A flag without a meaning, or the large sensor in use whatever the current, and rightly so.
+        if !configuration.front_end.has_two_ranges()
+            || self.open_sensor.finding(Range::Small).is_fault()
+        {
             self.flag = self.flag_plausibility.rest();
             return;
         }
@@ -1170,9 +1182,15 @@ impl Measurement {
         !self.vehicle.hv_feedback && self.vehicle.can_high_voltage != Some(true)
     }
 
+    /// High voltage is off and must not be switched on.
+    #[inline(never)]
+    fn is_at_rest(&self) -> bool {
+        self.high_voltage_is_off() && !self.key_outputs.hv_permit
+    }
+
     fn zero_conditions(&self) -> ZeroConditions {
         ZeroConditions {
-            high_voltage_is_off: self.high_voltage_is_off() && !self.key_outputs.hv_permit,
+            high_voltage_is_off: self.is_at_rest(),
             meter_mean: self.meter_mean(),
         }
     }

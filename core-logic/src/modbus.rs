@@ -172,13 +172,16 @@ impl Command {
     #[must_use]
     pub const fn when(self) -> CommandRule {
         match self {
-            Self::ZeroNow | Self::StartKeyCalibration => CommandRule::Idle,
-            // Not before what is to be saved is in the flash, and not in the place of another order to it.
-            Self::Restore | Self::FactoryDefaults => CommandRule::IdleFlashFree,
+            // Not before what is to be saved is in the flash, and not in the place of another order to it, whose end would be
+            // taken for this one's.
+            Self::ZeroNow
+            | Self::StartKeyCalibration
+            | Self::Restore
+            | Self::FactoryDefaults
+            | Self::ClearLog => CommandRule::Idle,
             Self::SupplyPointAtZero | Self::SupplyPointAtCurrent => CommandRule::SupplySweep,
             Self::FinishSupplyCalibration => CommandRule::SupplySweepBegun,
             Self::Save => CommandRule::FlashFree,
-            Self::ClearLog => CommandRule::FlashFreeWithoutHighVoltage,
             Self::Abort | Self::ClearDiagnoses => CommandRule::Always,
         }
     }
@@ -189,18 +192,14 @@ impl Command {
 pub enum CommandRule {
     /// None.
     Always,
-    /// High voltage off, no calibration under way.
-    Idle,
     /// High voltage off, no calibration under way, flash not busy.
-    IdleFlashFree,
-    /// High voltage off, no calibration but the supply sweep under way.
+    Idle,
+    /// High voltage off, no calibration but the supply sweep under way, flash not busy.
     SupplySweep,
-    /// High voltage off, the supply sweep under way.
+    /// High voltage off, the supply sweep under way, flash not busy.
     SupplySweepBegun,
     /// Flash not busy.
     FlashFree,
-    /// Flash not busy, high voltage off.
-    FlashFreeWithoutHighVoltage,
 }
 
 impl CommandRule {
@@ -209,62 +208,36 @@ impl CommandRule {
     pub const fn text(self) -> &'static str {
         match self {
             Self::Always => "always",
-            Self::Idle => "high voltage off, no calibration under way",
-            Self::IdleFlashFree => "high voltage off, no calibration under way, flash not busy",
-            Self::SupplySweep => "high voltage off, no other calibration under way",
-            Self::SupplySweepBegun => "high voltage off, supply calibration under way",
+            Self::Idle => "high voltage off, no calibration under way, flash not busy",
+            Self::SupplySweep => "high voltage off, no other calibration under way, flash not busy",
+            Self::SupplySweepBegun => {
+                "high voltage off, supply calibration under way, flash not busy"
+            }
             Self::FlashFree => "flash not busy",
-            Self::FlashFreeWithoutHighVoltage => "high voltage off, flash not busy",
         }
     }
 
     fn check(self, readings: &Readings) -> Result<(), Exception> {
-        let quiet = || match readings.high_voltage() {
-            true => Err(Exception::ServerDeviceFailure),
-            false => Ok(()),
-        };
-        let unless = |busy: bool| match busy {
-            true => Err(Exception::ServerDeviceBusy),
-            false => Ok(()),
-        };
-        let flash_free = || unless(readings.storage_busy);
-        // A restore would put another correction under what is being taken.
-        let settings_stay = || unless(readings.configuration_in_transfer);
         match self {
-            Self::Always => Ok(()),
-            Self::Idle => {
-                When::Standstill.check(readings)?;
-                settings_stay()
-            }
-            Self::IdleFlashFree => {
-                When::Standstill.check(readings)?;
-                flash_free()
-            }
-            Self::SupplySweep => {
-                quiet()?;
+            Self::Always => return Ok(()),
+            Self::FlashFree => {}
+            Self::Idle => When::Standstill.check(readings)?,
+            Self::SupplySweep | Self::SupplySweepBegun => {
+                let must_be_begun = self == Self::SupplySweepBegun;
                 match readings.activity {
-                    Activity::None | Activity::SupplyCalibration => settings_stay(),
+                    _ if readings.high_voltage() => return Err(Exception::ServerDeviceFailure),
+                    Activity::None if must_be_begun => return Err(Exception::ServerDeviceFailure),
+                    Activity::None | Activity::SupplyCalibration => {}
                     Activity::ZeroDrift | Activity::KeyCalibration => {
-                        Err(Exception::ServerDeviceBusy)
+                        return Err(Exception::ServerDeviceBusy);
                     }
                 }
-            }
-            Self::SupplySweepBegun => {
-                quiet()?;
-                match readings.activity {
-                    Activity::SupplyCalibration => settings_stay(),
-                    Activity::None => Err(Exception::ServerDeviceFailure),
-                    Activity::ZeroDrift | Activity::KeyCalibration => {
-                        Err(Exception::ServerDeviceBusy)
-                    }
-                }
-            }
-            Self::FlashFree => flash_free(),
-            Self::FlashFreeWithoutHighVoltage => {
-                quiet()?;
-                flash_free()
             }
         }
+        if readings.storage_busy {
+            return Err(Exception::ServerDeviceBusy);
+        }
+        Ok(())
     }
 }
 
@@ -1065,7 +1038,20 @@ mod tests {
             (C::ZeroNow, (true, A::None, false), 4),
             (C::ZeroNow, (false, A::ZeroDrift, false), 6),
             (C::ZeroNow, (false, A::SupplyCalibration, false), 6),
-            (C::ZeroNow, (false, A::None, true), 0),
+            (C::ZeroNow, (false, A::None, true), 6),
+            (C::StartKeyCalibration, (false, A::None, true), 6),
+            (C::SupplyPointAtZero, (false, A::None, true), 6),
+            (
+                C::SupplyPointAtCurrent,
+                (false, A::SupplyCalibration, true),
+                6,
+            ),
+            (
+                C::FinishSupplyCalibration,
+                (false, A::SupplyCalibration, true),
+                6,
+            ),
+            (C::ClearLog, (false, A::ZeroDrift, false), 6),
             (C::StartKeyCalibration, quiet, 0),
             (C::StartKeyCalibration, (true, A::None, false), 4),
             (C::StartKeyCalibration, (false, A::KeyCalibration, false), 6),
@@ -1128,7 +1114,6 @@ mod tests {
             (C::ClearLog, (true, A::None, false), 4),
             (C::ClearLog, (true, A::None, true), 4),
             (C::ClearLog, (false, A::ZeroDrift, true), 6),
-            (C::ClearLog, (false, A::ZeroDrift, false), 0),
             (C::ClearDiagnoses, (true, A::KeyCalibration, true), 0),
         ];
         for (command, (high_voltage, activity, busy), answer) in cases {
@@ -1149,24 +1134,19 @@ mod tests {
                 );
             }
         }
-        assert_eq!(
-            board_text(C::ZeroNow),
-            "high voltage off, no calibration under way"
-        );
+        let idle = "high voltage off, no calibration under way, flash not busy";
+        for command in [C::ZeroNow, C::Restore, C::ClearLog] {
+            assert_eq!(board_text(command), idle);
+        }
         assert_eq!(
             board_text(C::SupplyPointAtZero),
-            "high voltage off, no other calibration under way"
+            "high voltage off, no other calibration under way, flash not busy"
         );
         assert_eq!(
             board_text(C::FinishSupplyCalibration),
-            "high voltage off, supply calibration under way"
-        );
-        assert_eq!(
-            board_text(C::Restore),
-            "high voltage off, no calibration under way, flash not busy"
+            "high voltage off, supply calibration under way, flash not busy"
         );
         assert_eq!(board_text(C::Save), "flash not busy");
-        assert_eq!(board_text(C::ClearLog), "high voltage off, flash not busy");
         assert_eq!(board_text(C::Abort), "always");
     }
 

@@ -285,7 +285,7 @@ pub fn from_words(words: &[u32; SLOT_WORDS]) -> [u8; SLOT_BYTES] {
 pub struct SavePolicyConfig {
     /// Change of the charge counter after which it is saved.
     pub charge_interval: Nanocoulombs,
-    /// Time after which any change is saved, in seconds.
+    /// Time after which the state is saved whatever has changed, in seconds.
     pub time_interval_s: u32,
 }
 
@@ -342,8 +342,9 @@ impl SavePolicy {
             .saturating_sub(self.saved_total)
             .saturating_abs();
         let interval = Duration::from_ticks(u64::from(config.time_interval_s) * 1_000_000);
-        change != Nanocoulombs::ZERO
-            && (change >= config.charge_interval || elapsed(self.saved_at, now) >= interval)
+        // The state of charge can change with no charge at all: anchored at rest, or by another capacity.
+        (change >= config.charge_interval && change != Nanocoulombs::ZERO)
+            || elapsed(self.saved_at, now) >= interval
     }
 
     /// The state with this counter is in flash.
@@ -675,12 +676,14 @@ mod tests {
         assert!(!due(&policy, 69, 1));
         assert!(due(&policy, 70, 1));
         assert!(due(&policy, 70, -1));
-        assert!(!due(&policy, 1_000, 0));
+        // An anchor of the state of charge leaves the counter as it is.
+        assert!(!due(&policy, 69, 0));
+        assert!(due(&policy, 70, 0));
         policy.saved(at(70), total(1));
         assert!(!due(&policy, 129, 0));
         assert!(due(&policy, 130, 0));
-        assert!(!due(&policy, 130, 1));
-        // No interval configured: every change, and never without one.
+        assert!(due(&policy, 130, 1));
+        // No interval configured: every change, and by the time alone without one.
         let always = SavePolicyConfig {
             charge_interval: Nanocoulombs::ZERO,
             ..config

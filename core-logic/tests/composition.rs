@@ -478,6 +478,16 @@ fn a_supply_sweep_by_orders_gives_the_relations() {
     assert_eq!(bench.readings().command_state, CommandState::Done);
     assert_eq!(bench.readings().activity, Activity::None);
 
+    // One that was begun and left ends with the drive.
+    assert_eq!(bench.order(Order::SupplyPointAtZero), Ok(()));
+    bench.vehicle.hv_feedback = true;
+    bench.run_ms(20);
+    assert_eq!(bench.readings().activity, Activity::None);
+    let validity = bench.measurement.current().validity;
+    assert!(!validity.contains(Validity::CALIBRATING));
+    bench.vehicle.hv_feedback = false;
+    bench.run_ms(20);
+
     // A point of an invalid reading, and an aborted sweep.
     assert_eq!(bench.order(Order::SupplyPointAtZero), Ok(()));
     assert_eq!(bench.order(Order::Abort), Ok(()));
@@ -593,6 +603,10 @@ fn a_zero_calibration_reports_progress_ends_and_can_be_aborted() {
         bench.configuration.zero_drift.value.small,
         Microamps(65_104)
     );
+    // Mended by hand, which the board cannot see.
+    assert_eq!(bench.order(Order::ClearDiagnoses), Ok(()));
+    bench.run_ms(1_100);
+    assert!(!bench.has(Code::ZeroDriftBeyondLimit));
 
     // Nothing arrives: it ends by itself.
     bench.code = 4_100;
@@ -1395,6 +1409,52 @@ fn a_flag_that_contradicts_the_level_is_reported_and_chatter_too() {
             .validity
             .contains(Validity::IMPLAUSIBLE)
     );
+}
+
+/// What one front end was found to have is not the next one's: nothing would judge it again.
+#[test]
+fn another_front_end_begins_without_the_faults_of_the_one_before() {
+    // A flag that contradicts the level, an open small sensor, and an ADS1100 that does not answer.
+    let found: [fn(&mut Bench); 3] = [
+        |bench| {
+            bench.range = Range::Large;
+            bench.code = 4_096 + 61;
+            bench.environment.network = Some(network_output(Microvolts(2_500_000 + 375_000)));
+        },
+        |bench| {
+            bench.code = 0;
+            bench.environment.network = Some(network_output_open());
+        },
+        |bench| {
+            bench.next_conversion = u64::MAX;
+            bench
+                .measurement
+                .on_converter_fault(ConverterFault::NoAnswer, Instant::from_ticks(bench.now));
+        },
+    ];
+    for (case, find) in found.into_iter().enumerate() {
+        let mut bench = Bench::new(Configuration::default());
+        bench.run_ms(500);
+        find(&mut bench);
+        bench.run_ms(500);
+        assert!(!bench.measurement.current().validity.is_valid(), "{case}");
+        let converter = bench.configuration.converter;
+        bench.configuration = with_front_end(FrontEnd::Network(Network::default()));
+        bench.configuration.converter = converter;
+        bench
+            .measurement
+            .configuration_changed(&bench.configuration);
+        bench.environment.network = Some(network_output(Microvolts::ZERO));
+        bench.range = Range::Small;
+        bench.next_conversion = u64::MAX;
+        bench.run_ms(1_500);
+        let active = bench.measurement.diagnosis().active();
+        assert!(
+            bench.measurement.current().validity.is_valid(),
+            "{case}: {active:?} {:?}",
+            bench.measurement.current()
+        );
+    }
 }
 
 #[test]

@@ -465,7 +465,7 @@ fields! {
     0x0806 U32 1 Always (0, 10_000) "open sensor: clear time" "ms" "from the first to the last of the good ones" [at open_sensor.clear_time_ms];
     0x0808 I32 2 Always (-55_000, 150_000) "temperature limits" "m°C" "lowest and highest of sensors and board, beyond which it is reported" [list temperature_limits];
     0x0840 I64 1 Always (1_000_000_000i64, 100_000_000_000_000i64) "save: charge interval" "nC" "change of the charge counter after which it is written to flash" [at save_policy.charge_interval];
-    0x0844 U32 1 Always (10, 86_400) "save: time interval" "s" "after which any change is written to flash" [at save_policy.time_interval_s];
+    0x0844 U32 1 Always (10, 86_400) "save: time interval" "s" "after which the state is written to flash, whatever has changed" [at save_policy.time_interval_s];
 
     0x0900 U16 1 Always (1, 247) "Modbus address" "" "answers from the next request on" [at rtu.address];
     0x0901 U16 1 Always (0, 50_000) "turnaround" "µs" "silence before an answer, at least the 1,750 µs that end a request" [at rtu.turnaround_us];

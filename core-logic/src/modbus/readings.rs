@@ -65,7 +65,7 @@ readings! {
     reset_cause: u16,
     /// Resets since the retained memory was last lost.
     resets: u32,
-    /// Hash of the last panic's message, 0 without one.
+    /// Of the last panic the CRC-32 of its file's name, of a fault the program counter; 0 without one.
     panic_hash: u32,
     /// Most stack ever used, in bytes.
     stack_high_water: u32,
@@ -286,7 +286,7 @@ inputs! {
     0x000D U16 1 "reset cause" "bits" "the weightiest: 1 power, 2 reset pin, 4 software, 8 independent watchdog, 16 window watchdog, 32 low power, 64 brown-out" |r, _| r.reset_cause.into();
     0x000E U32 1 "uptime" "s" "time since the start" |r, _| r.uptime_s.into();
     0x0010 U32 1 "resets" "" "resets since the retained memory was last lost" |r, _| r.resets.into();
-    0x0012 U32 1 "panic" "" "hash of the last panic, 0 without one" |r, _| r.panic_hash.into();
+    0x0012 U32 1 "panic" "" "of the last panic the CRC-32 of its file's name, of a fault the program counter; 0 without one" |r, _| r.panic_hash.into();
     0x0014 U32 1 "stack high water" "B" "most stack ever used" |r, _| r.stack_high_water.into();
     0x0016 U32 1 "snapshot latency" "µs" "longest time from a range edge to its charge snapshot" |r, _| r.snapshot_latency_us.into();
 
@@ -301,7 +301,7 @@ inputs! {
     0x0028 U32 1 "configuration generation" "" "changes of the active configuration since the start" |r, _| r.configuration_generation.into();
     0x002A U32 1 "configuration CRC" "" "CRC-32 of the active configuration" |r, _| r.configuration_crc.into();
     0x002C U16 1 "configuration saved" "" "1 when flash holds the active configuration" |r, _| r.configuration_saved.into();
-    0x002D U16 1 "flash busy" "" "1 while flash is written or erased" |r, _| r.storage_busy.into();
+    0x002D U16 1 "flash busy" "" "1 while a client's save, restore, defaults or clear log is under way" |r, _| r.storage_busy.into();
 
     // Current.
     0x0040 I32 1 "current" "mA" "of the last conversion, positive is discharge" |r, _| r.current.to_milliamps().into();
