@@ -10,7 +10,7 @@ use twin::{
     failure::Failure,
     model::Model,
     prepare::{Inputs, Prepared, Purpose, prepare},
-    problem::{Base, Problem, View},
+    problem::{Base, BatteryBase, Problem, View},
 };
 
 const PAIR: &str = "schema = 1\n[sensor]\n";
@@ -603,6 +603,61 @@ fn what_goes_by_the_resistance_needs_one() {
     };
     assert!(!lacks(BATTERY));
     assert!(lacks(&BATTERY.replace("ohmic_resistance_ohm = 0.01\n", "")));
+}
+
+fn battery_of(problem: &Problem) -> &BatteryBase {
+    match &problem.base {
+        Base::Battery(base) => base,
+        Base::Sensor(_) => panic!("{problem:?}"),
+    }
+}
+
+#[test]
+fn what_flowed_before_the_first_reading_is_not_lost() {
+    let is_read = |row: &[f64]| row[0] >= 700.0;
+    let rows = cell(&[(600, 1.0), (1200, 0.5)]);
+    // On the current's rows, on rows of their own, and beside a current that reads 0.1 A too much.
+    let shared = rows.iter().map(|row| {
+        let volts = if is_read(row) { row[2] } else { f64::NAN };
+        vec![row[0], row[1], volts]
+    });
+    let own = rows.iter().flat_map(|row| {
+        let current = vec![row[0], row[1], f64::NAN];
+        let volts = is_read(row).then(|| vec![row[0] + 0.25, f64::NAN, row[2]]);
+        std::iter::once(current).chain(volts)
+    });
+    let off = shared.clone().map(|row| vec![row[0], row[1] + 0.1, row[2]]);
+    let header = "t_s,i_ref_a,v_cell_v";
+    let zero = format!("{BATTERY}current_zero_a = 0.1\n");
+    for (model, recording) in [
+        (BATTERY, text(header, shared.clone())),
+        (BATTERY, text(header, own)),
+        (&zero, text(header, off)),
+    ] {
+        let (problem, remarks) = one(model, &recording);
+        let base = battery_of(&problem);
+        assert!(
+            (base.initial_soc[0] - 0.9).abs() < 1e-6,
+            "{:?} {remarks:?}",
+            base.initial_soc
+        );
+    }
+}
+
+#[test]
+fn what_flowed_after_the_last_reading_is_no_contradiction() {
+    // 1 A throughout, no row for 100 s, and voltages until ten minutes before that.
+    let rows = cell(&[(1900, 1.0)]).into_iter();
+    let rows = rows
+        .filter(|row| !(1200.0..1300.0).contains(&row[0]))
+        .map(|row| {
+            let is_read = row[0] < 600.0 || row[0] >= 1300.0;
+            vec![row[0], row[1], if is_read { row[2] } else { f64::NAN }]
+        });
+    let (problem, _) = one(BATTERY, &text("t_s,i_ref_a,v_cell_v", rows));
+    let base = battery_of(&problem);
+    assert_eq!(base.gap_soc_sigma, [0.0, 0.0]);
+    assert!((base.initial_soc[1] - (0.9 - 1300.0 / 3600.0)).abs() < 1e-6);
 }
 
 #[test]

@@ -19,6 +19,8 @@ const AT_REST_V: f64 = 0.010;
 const OF_READING: f64 = 0.005;
 /// No reading is worth less than this uncertainty, 0 … 1: where the open-circuit voltage is flat it tells nothing.
 const WORTH: f64 = 0.3;
+/// What flowed between a reading and a segment's end is off by this share of itself: so much of its capacity a worn cell has lost.
+const WORN: f64 = 0.2;
 /// A tester's counter is believed over a gap if it has followed the current within this share of the capacity before.
 const COUNTER_SHARE: f64 = 0.02;
 /// A gap that leaves less than this of the state of charge open, 0 … 1, leaves nothing open: where a voltage is as steep as 1 V from full to
@@ -65,7 +67,9 @@ pub(super) fn find(
         let mut gap_sigma = 0.0;
         let first = if drive.is_continued(index) {
             let gap_s = drive.t_s[own.start] - drive.t_s[own.start - 1];
-            let ends_a = [drive.reference[own.start - 1], drive.reference[own.start]];
+            // The counter is beside the current as it was recorded; through the battery flows what is left of that without its zero.
+            let recorded_a = [drive.reference[own.start - 1], drive.reference[own.start]];
+            let ends_a = recorded_a.map(|end_a| end_a - base.current_zero_a);
             let before = &drive.segments[index - 1];
             let counted = readings
                 .counter_ah
@@ -73,7 +77,7 @@ pub(super) fn find(
             let left_ah = |excess_ah| gap_ah(ends_a, gap_s, excess_ah, battery.efficiency);
             let line = end - left_ah(0.0) / battery.capacity_ah;
             match counted {
-                Some(ah) => excess_ah = ah - gap_ah(ends_a, gap_s, 0.0, 1.0),
+                Some(ah) => excess_ah = ah - gap_ah(recorded_a, gap_s, 0.0, 1.0),
                 None => {
                     let sigma = gap_s * line_sigma_a(drive, index) / 3600.0 / battery.capacity_ah;
                     let sigma = sigma.max(contradicted(base, readings, index, line - end));
@@ -104,7 +108,7 @@ pub(super) fn find(
         base.initial_soc.push(first);
         base.gap_excess_ah.push(excess_ah);
         base.gap_soc_sigma.push(gap_sigma);
-        end = first - charge_ah(drive, own.clone(), battery.efficiency) / battery.capacity_ah;
+        end = first - flowed(base, drive, own.clone());
     }
     if bridged > 0 {
         work.remark(format!(
@@ -224,11 +228,12 @@ fn weighted(one: Soc, other: Soc) -> f64 {
     }
 }
 
-/// Ah over a segment, charging times the efficiency.
-fn charge_ah(drive: &Drive, rows: Range<usize>, efficiency: f64) -> f64 {
+/// Ah over rows of a segment of a current that reads `zero_a` without one, charging times the efficiency.
+fn charge_ah(drive: &Drive, rows: Range<usize>, zero_a: f64, efficiency: f64) -> f64 {
     let mut charge = 0.0;
     for row in rows.start + 1..rows.end {
-        let [from, to] = drive.ends(row, [drive.reference[row - 1], drive.reference[row]]);
+        let ends = drive.ends(row, [drive.reference[row - 1], drive.reference[row]]);
+        let [from, to] = ends.map(|end_a| end_a - zero_a);
         let mean_a = mean_flow(from, to, efficiency);
         charge += mean_a * (drive.t_s[row] - drive.t_s[row - 1]);
     }
@@ -245,7 +250,7 @@ fn over_gap(
 ) -> Option<f64> {
     let last = before.end - 1;
     let counted = ah[last] - ah[before.start];
-    let flowed = charge_ah(drive, before, 1.0);
+    let flowed = charge_ah(drive, before, 0.0, 1.0);
     let over = ah[after] - ah[last];
     let follows = (counted - flowed).abs() <= COUNTER_SHARE * capacity_ah;
     (follows && over.is_finite() && over.abs() <= capacity_ah).then_some(over)
@@ -298,26 +303,27 @@ fn contradicted(base: &BatteryBase, readings: &Readings<'_>, segment: usize, lin
     }
 }
 
-/// State of charge at the start of a segment from its first reading.
+/// State of charge at the start of a segment from its first reading, and what flowed until then.
 fn seen(base: &BatteryBase, readings: &Readings<'_>, segment: usize) -> Option<Soc> {
-    let drive_row = readings.drive.segments[segment].start;
-    seen_at(
-        base,
-        readings,
-        drive_row,
-        read_rows(readings.observed, segment).next()?,
-    )
+    let first = read_rows(readings.observed, segment).next()?;
+    let ((soc, sigma), at) = seen_at(base, readings, first)?;
+    let until = readings.drive.segments[segment].start..at + 1;
+    let lost = flowed(base, readings.drive, until);
+    Some((soc + lost, sigma.hypot(WORN * lost)))
 }
 
 /// The same at its end from its last one.
 fn last_seen(base: &BatteryBase, readings: &Readings<'_>, segment: usize) -> Option<Soc> {
-    let drive_row = readings.drive.segments[segment].end - 1;
-    seen_at(
-        base,
-        readings,
-        drive_row,
-        read_rows(readings.observed, segment).last()?,
-    )
+    let last = read_rows(readings.observed, segment).last()?;
+    let ((soc, sigma), at) = seen_at(base, readings, last)?;
+    let since = at..readings.drive.segments[segment].end;
+    let lost = flowed(base, readings.drive, since);
+    Some((soc - lost, sigma.hypot(WORN * lost)))
+}
+
+/// State of charge, 0 … 1, that a battery loses over some rows of a segment.
+fn flowed(base: &BatteryBase, drive: &Drive, rows: Range<usize>) -> f64 {
+    charge_ah(drive, rows, base.current_zero_a, base.efficiency) / base.capacity_ah
 }
 
 /// Rows of a segment that were read.
@@ -329,28 +335,28 @@ fn read_rows(observed: &Observed, segment: usize) -> impl Iterator<Item = usize>
     rows.filter(|row| observed.valid[*row] && observed.value[*row].is_finite())
 }
 
-/// State of charge from a reading, by the current at a row of the drive.
-fn seen_at(
-    base: &BatteryBase,
-    readings: &Readings<'_>,
-    drive_row: usize,
-    row: usize,
-) -> Option<Soc> {
+/// State of charge from a reading, by the current then, and the drive's row of that.
+fn seen_at(base: &BatteryBase, readings: &Readings<'_>, row: usize) -> Option<(Soc, usize)> {
     let (drive, observed) = (readings.drive, readings.observed);
+    let drive_row = observed.drive_row_before(drive, row)?;
     let value = observed.value[row];
     // Noise of that one reading, and what rounding takes of it.
     let noise = readings.noise.hypot(observed.grid / 12f64.sqrt());
     if readings.view == View::StateOfCharge {
-        return Some((value / 100.0, OF_READING.hypot(noise / 100.0)));
+        let soc = (value / 100.0, OF_READING.hypot(noise / 100.0));
+        return Some((soc, drive_row));
     }
-    let current_a = drive.reference[drive_row];
+    let current_a = drive.reference[drive_row] - base.current_zero_a;
     let rest_v = base.cells * AT_REST_V;
     let there = inverse(&base.ocv, value + base.resistance_ohm * current_a, rest_v)?;
     // A voltage under load says little.
     let loaded_v = 0.5 * base.resistance_ohm * current_a.abs();
     let within_v = (rest_v + loaded_v).hypot(noise);
     let within_v = within_v.hypot(there.bend_v);
-    Some((there.soc, (within_v / there.slope_v).min(WORTH)))
+    Some((
+        (there.soc, (within_v / there.slope_v).min(WORTH)),
+        drive_row,
+    ))
 }
 
 /// Where an open-circuit voltage is on the table.
