@@ -286,7 +286,7 @@ fn tell(
         report.unexplained.push(Unexplained {
             signal: problem.name.clone(),
             rmse: rms(shown.residual.iter().copied()),
-            explainable_share: left.share,
+            explainable_share: if left.is_real() { left.share } else { 0.0 },
             location: place,
         });
     }

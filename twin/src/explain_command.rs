@@ -305,14 +305,20 @@ fn copied(fitted: &Prepared, other: &Prepared) -> Option<String> {
 /// most frequent differences of time between equal readings.
 fn origins(some: &[(f64, u64)], known: &HashMap<u64, Vec<f64>>) -> Vec<f64> {
     const TRIED: usize = 3;
-    const LEAST: usize = 20;
-    let all: usize = known.values().map(Vec::len).sum();
-    let each = (all / known.len().max(1)).max(1);
-    let taken = (ORIGIN_PAIRS / each).max(LEAST);
-    let every = some.len().div_ceil(taken).max(1);
+    // Values that are rare tell it best, and cost least.
+    let mut alike: Vec<(f64, &Vec<f64>)> = some
+        .iter()
+        .filter_map(|(t_s, value)| known.get(value).map(|times| (*t_s, times)))
+        .collect();
+    alike.sort_by_key(|(_, times)| times.len());
+    let mut pairs = 0;
     let mut votes: HashMap<i64, (usize, f64)> = HashMap::new();
-    for (t_s, value) in some.iter().step_by(every) {
-        for known_s in known.get(value).into_iter().flatten() {
+    for (t_s, times) in alike {
+        if pairs >= ORIGIN_PAIRS {
+            break;
+        }
+        pairs += times.len();
+        for known_s in times {
             let origin_s = known_s - t_s;
             #[expect(clippy::cast_possible_truncation, reason = "saturates")]
             let cell = (origin_s / REWRITTEN_S).round() as i64;

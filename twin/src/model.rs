@@ -413,6 +413,21 @@ fn check_coloured(
     Ok(())
 }
 
+/// What an instrument may be off by is no less than nothing.
+fn check_accuracy(
+    places: &Places<'_>,
+    [table, key]: [&str; 2],
+    accuracy: &AccuracySpec,
+) -> Result<(), Failure> {
+    for (part, value) in [("zero", accuracy.zero), ("gain", accuracy.gain)] {
+        if !(value.is_finite() && value >= 0.0) {
+            let expected = "a number, zero or more";
+            return Err(places.fault(&[table, key, part], &number(value), expected));
+        }
+    }
+    Ok(())
+}
+
 fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
     positive(
         places,
@@ -436,15 +451,7 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
         sensor.noise_coloured,
         sensor.noise_coloured_tau_s,
     )?;
-    for (key, value) in [
-        ("zero", sensor.accuracy.zero),
-        ("gain", sensor.accuracy.gain),
-    ] {
-        if !(value.is_finite() && value >= 0.0) {
-            let expected = "a number, zero or more";
-            return Err(places.fault(&["sensor", "accuracy", key], &number(value), expected));
-        }
-    }
+    check_accuracy(places, ["sensor", "accuracy"], &sensor.accuracy)?;
     if sensor.smooth_reference && sensor.held_reference {
         let expected = "one of smooth_reference and held_reference";
         return Err(places.fault(&["sensor", "smooth_reference"], "both", expected));
@@ -611,6 +618,8 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         }
         (true, Some(file)) => read_ocv(file)?,
     };
+    check_accuracy(places, ["battery", "accuracy_v"], &text.accuracy_v)?;
+    check_accuracy(places, ["battery", "accuracy_pct"], &text.accuracy_pct)?;
     Ok(Battery {
         capacity_ah: capacity,
         efficiency,

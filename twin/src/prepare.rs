@@ -21,6 +21,7 @@ use std::{path::PathBuf, sync::Arc};
 use recording::name;
 
 pub use frame::Frame;
+use held::is_held;
 pub use held::{Freshness, freshness};
 
 use crate::{
@@ -376,10 +377,7 @@ impl<'a> Work<'a> {
             None => Freshness::all(self.frame.t_s().len()),
         };
         if let Some(interval_s) = fresh.interval_s {
-            self.remark(format!(
-                "{measured} is read more often than it is measured: a new value about every {}; repeats are left out",
-                seconds(interval_s)
-            ));
+            self.remark(is_held(&measured, interval_s));
         }
         self.find_clock(found, value, &fresh, &measured)?;
         let parts = series::drive(self.drive_frame(), found);

@@ -87,7 +87,7 @@ fn the_models_of_this_project_are_read() {
 
 #[test]
 fn faults_name_line_key_and_what_was_expected() {
-    let cases: [(&str, &[&str]); 37] = [
+    let cases: [(&str, &[&str]); 40] = [
         (
             "schema = 1\n[sensor]\nstepp = 1\n",
             &["line 3", "stepp", "`step`", "`noise_coloured`"],
@@ -195,6 +195,18 @@ fn faults_name_line_key_and_what_was_expected() {
         (
             "schema = 1\n[sensor]\naccuracy = 0.3\n",
             &["line 3", "key accuracy", "a table { zero = …, gain = … }"],
+        ),
+        (
+            "schema = 1\n[sensor]\naccuracy = { zero = nan }\n",
+            &["line 3", "key sensor.accuracy.zero", "a number, zero or more"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\naccuracy_v = { gain = -0.01 }\n",
+            &["line 4", "key battery.accuracy_v.gain", "a number, zero or more"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\naccuracy_pct = { zero = nan }\n",
+            &["line 4", "key battery.accuracy_pct.zero", "a number, zero or more"],
         ),
         (
             "schema = 1\n[sensor]\naverage = 1.5\n",

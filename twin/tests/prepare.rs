@@ -199,6 +199,31 @@ fn the_last_digits_of_arithmetic_are_no_new_reading() {
 }
 
 #[test]
+fn a_held_voltage_counts_once_and_a_rest_is_not_held() {
+    let loads = (0..100).map(|k| (8, [0.5, 2.0, 1.0, -0.5][k % 4]));
+    let steps: Vec<(usize, f64)> = loads.chain([(400, 0.0)]).collect();
+    let rows = cell(&steps);
+    // Written each second, read each 10 s; and in steps of 1 mV, read each second.
+    let held = rows
+        .iter()
+        .map(|row| vec![row[0], row[1], rows[row[0] as usize / 10 * 10][2]]);
+    let in_steps = rows
+        .iter()
+        .map(|row| vec![row[0], row[1], (1e3 * row[2]).round() / 1e3]);
+    let header = "t_s,i_ref_a,v_cell_v";
+    let (problem, remarks) = one(BATTERY, &text(header, held));
+    // At rest it stays, and counts again when it must have been read again.
+    let fresh =
+        |rows: std::ops::Range<usize>| rows.filter(|row| problem.observed.valid[*row]).count();
+    assert_eq!(fresh(0..800), 80);
+    assert!((20..=40).contains(&fresh(800..1200)));
+    let says = |remark: &String| remark.contains("a new value about every 10.0");
+    assert!(remarks.iter().any(says), "{remarks:?}");
+    let (problem, _) = one(BATTERY, &text(header, in_steps));
+    assert_eq!(problem.observed.valid_rows(), 1200);
+}
+
+#[test]
 fn a_held_value_that_stays_the_same_was_measured_again() {
     // At a rail from 5 s to 10 s.
     let rows = (0..1000).map(|k| {

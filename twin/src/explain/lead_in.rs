@@ -48,7 +48,7 @@ pub(super) fn missed(bench: &Workbench<'_>, shown: &Fit) -> Option<[f64; 2]> {
         return None;
     }
     let problem = bench.problem;
-    let noise = shown.sigma.max(problem.noise).hypot(problem.coloured.rms);
+    let noise = shown.sigma.max(problem.noise);
     // Of those that count: not what is repeated or empty.
     let reaching: Vec<usize> = reaching_out(problem, reach)
         .iter()

@@ -11,7 +11,7 @@ use super::strays::{STRAY, noise_is_stated, slipped, strays};
 use super::told::short;
 use super::workbench::{Member, Model, Workbench};
 use super::{Held, intervals, jumps, rms};
-use crate::problem::{Accuracy, Coloured};
+use crate::problem::{Accuracy, Coloured, View};
 use crate::report::data::Verdict;
 
 /// Structure left beside the named effects makes the explanation a partial one from this share of the residual on.
@@ -35,6 +35,8 @@ const TRACES: f64 = 0.05;
 const DOUBTED: f64 = 0.0025;
 /// What is left has to have this many times the energy of the stated noise to be beyond it: noise is stated to five percent at best.
 pub(super) const STATED: f64 = 1.1;
+/// A sensor that moves with less than this share of the simulation's energy follows it no more than by chance.
+const DEAD: f64 = 0.01;
 /// Of fewer means than this their spread tells nothing.
 const LEAST_MEANS: usize = 8;
 
@@ -53,6 +55,15 @@ pub(super) fn judge(
     if selection.named.is_empty() {
         return without_names(bench, selection, before);
     }
+    if follows_nothing(bench, selection) {
+        let ids = selection.fit.model.ids().join(", ");
+        selection.refused.push(format!(
+            "{ids}: what they leave of the simulation moves less than what remains beside it: the readings follow nothing, and many things make a sensor dead"
+        ));
+        selection.fit = selection.plain.clone();
+        selection.named.clear();
+        return Verdict::Unknown;
+    }
     let slips = slipped(bench, &selection.plain, &selection.fit);
     let energy = |residual: &[f64]| without_rows(residual, &slips);
     let rest = energy(&selection.fit.residual);
@@ -63,15 +74,19 @@ pub(super) fn judge(
     } else {
         0.0
     };
-    // What is beyond the noise that the design states is structure too, whatever the inputs say of it.
+    // What is beyond the noise that the design states is structure too, whatever the inputs say of it; where it states none, beyond
+    // what noise can be by the jumps of what is left, and more than traces.
+    let jumping = spread(&jumps(&selection.fit.residual)).powi(2) / 2.0 * count;
     let louder = |rest: f64, unavoidable: f64, coloured: Coloured| {
         let allowed = allowed(bench, unavoidable);
-        let limit = LOUD * LOUD * allowed + swing(bench, coloured) * count;
-        if noise > 0.0 && rest > limit {
-            rest - allowed
+        let (allowed, limit) = if noise > 0.0 {
+            let swing = swing(bench, coloured) * count;
+            (allowed, LOUD * LOUD * allowed + swing)
         } else {
-            0.0
-        }
+            let slow = (SLOW * jumping.sqrt() + allowed.sqrt()).powi(2);
+            (allowed.max(jumping), slow.max(LEFT * explained))
+        };
+        if rest > limit { rest - allowed } else { 0.0 }
     };
     let beyond = louder(rest, unavoidable, bench.coloured());
     // Slips of the log speak against no name, and are left all the same.
@@ -97,9 +112,17 @@ pub(super) fn judge(
     }
     if beyond > 0.0 || drift > 0.0 || loud {
         let loud = if loud { all } else { rest_read };
+        let (floor, of) = if noise > 0.0 {
+            (unavoidable, "the noise that the model file states")
+        } else {
+            (
+                unavoidable.max(jumping),
+                "what it changes from reading to reading",
+            )
+        };
         selection.decisions.push(format!(
-            "What remains is {} times the noise that the model file states.",
-            short((loud / unavoidable).sqrt())
+            "What remains is {} times {of}.",
+            short((loud / floor).sqrt())
         ));
     }
     if smooth > 0.0 || beyond > 0.0 || drift > 0.0 || loud {
@@ -133,6 +156,22 @@ pub(super) fn judge(
     } else {
         Verdict::Explained
     }
+}
+
+/// Whether the named effects make a sensor read all but the same all the time: less than a hundredth of the energy with which the
+/// simulation moves, and less than what remains.
+fn follows_nothing(bench: &Workbench<'_>, selection: &Selection) -> bool {
+    if !matches!(bench.problem.view, View::Sensor | View::Charge) {
+        return false;
+    }
+    let count = bench.len().max(1) as f64;
+    let moves = |series: &[f64]| {
+        let mean = series.iter().sum::<f64>() / count;
+        series.iter().map(|value| (value - mean).powi(2)).sum()
+    };
+    let moved: f64 = moves(&selection.fit.predicted);
+    moved < DEAD * moves(&selection.plain.predicted)
+        && moved < dot(&selection.fit.residual, &selection.fit.residual)
 }
 
 /// Energy of a series but for some of its rows.

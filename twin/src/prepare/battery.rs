@@ -4,7 +4,11 @@ use std::sync::Arc;
 
 use recording::error::number;
 
-use super::{Item, Purpose, Work, checks, counter, held::Freshness, series, start};
+use super::{
+    Item, Purpose, Work, checks, counter,
+    held::{Freshness, freshness, is_held},
+    series, start,
+};
 use crate::{
     effects::{find_with, quantisation::lattice},
     explain::{self, by_temperature},
@@ -95,16 +99,17 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
                 if work.purpose.compares() {
                     checks::not_constant(value, name, work.frame.source())?;
                 }
-                work.observe(&drive, &parts.rows, &parts.clocks, value, &every)
+                let cells = cells_of(battery, name);
+                let fresh = held(work, view, found, value, battery.resistance_ohm * cells);
+                if let Some(interval_s) = fresh.interval_s {
+                    work.remark(is_held(name, interval_s));
+                }
+                work.observe(&drive, &parts.rows, &parts.clocks, value, &fresh)
             }
             None => (series::every_row(&drive), Arc::clone(&parts.rows)),
         };
         observed.grid = grid(work, name, &observed);
-        let cells = if name == PACK {
-            f64::from(battery.cells)
-        } else {
-            1.0
-        };
+        let cells = cells_of(battery, name);
         let ocv: Vec<(f64, f64)> = battery
             .ocv
             .iter()
@@ -184,6 +189,31 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
         });
     }
     Ok(items)
+}
+
+/// Cells in series behind a voltage.
+fn cells_of(battery: &Battery, name: &str) -> f64 {
+    if name == PACK {
+        f64::from(battery.cells)
+    } else {
+        1.0
+    }
+}
+
+/// Which voltages are new: those that stay while the current's drop over the resistance moves are held. A state of charge moves too little
+/// from row to row to tell, and a current of another file is beside other rows.
+fn held(
+    work: &Work<'_>,
+    view: View,
+    current_a: &[f64],
+    value: &[f64],
+    resistance_ohm: f64,
+) -> Freshness {
+    if view != View::Voltage || resistance_ohm == 0.0 || work.reference.is_some() {
+        return Freshness::all(value.len());
+    }
+    let drop_v: Vec<f64> = current_a.iter().map(|a| resistance_ohm * a).collect();
+    freshness(work.frame, &drop_v, value, true, 0.0)
 }
 
 /// Step of the grid on which the readings lie, 0 if there is none.

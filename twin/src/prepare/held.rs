@@ -2,8 +2,8 @@
 
 use std::borrow::Cow;
 
-use super::Frame;
 use super::series::{between_rows, median, share_rows};
+use super::{Frame, seconds};
 use crate::range::range;
 
 /// Share of repeats, while the reference moves, from which a sensor is read more often than it measures.
@@ -35,6 +35,14 @@ impl Freshness {
             interval_s: None,
         }
     }
+}
+
+/// What is said of held readings.
+pub fn is_held(name: &str, interval_s: f64) -> String {
+    format!(
+        "{name} is read more often than it is measured: a new value about every {}; repeats are left out",
+        seconds(interval_s)
+    )
 }
 
 /// Decides it for one column. `beside` says that the reference is in the same file, on the same rows or on others; without one, changes

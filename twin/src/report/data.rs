@@ -179,7 +179,8 @@ pub struct EffectReport {
     pub parameters: Vec<ParameterReport>,
     /// Share of the held-out squared error that goes when the effect is added last, 0 … 1.
     pub held_out_gain: f64,
-    /// 99th percentile of the same figure for placebos, maximum over the library.
+    /// 99th percentile of the same figure for placebos, maximum over the library; 0 where none was asked, because the readings show the
+    /// effect by themselves (they stay at an end, lie on a grid). The share is then of the error on all samples.
     pub placebo_p99: f64,
     /// What tells it if its place does: readings at instants at which alone it acts, too few for held-out samples and placebos.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -212,7 +213,8 @@ pub struct Unexplained {
     pub signal: String,
     /// Root mean square of what is left, in the signal's unit.
     pub rmse: f64,
-    /// Share of its energy that a smooth function of the recorded inputs could explain on held-out blocks, 0 … 1.
+    /// Share of its energy that a smooth function of the recorded inputs could explain on held-out blocks, 0 … 1; 0 if that is no more than
+    /// placebos explain.
     pub explainable_share: f64,
     /// Where it is largest.
     pub location: Option<Location>,

@@ -387,6 +387,14 @@ fn evidence(page: &mut String, effect: &EffectReport) {
         ));
         return;
     }
+    if effect.placebo_p99 == 0.0 {
+        page.push_str(&format!(
+            "<p>The readings show it by themselves, and it is <strong>{}</strong> of the squared error that is left without it, on all samples. \
+             No sample was left out for it and no placebo asked.</p>\n",
+            percent(effect.held_out_gain)
+        ));
+        return;
+    }
     let ratio = effect.held_out_gain / effect.placebo_p99;
     page.push_str("<div class=\"bars\" aria-hidden=\"true\">");
     for (what, class, share) in [

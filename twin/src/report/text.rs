@@ -169,6 +169,8 @@ fn effects(report: &Report, width: usize, fullness: Fullness) -> Vec<String> {
         let mut parameters = parameters.into_iter();
         let [gain, placebos] = if effect.by_place.is_some() {
             ["by place".to_owned(), String::new()]
+        } else if effect.placebo_p99 == 0.0 {
+            [percent(effect.held_out_gain), "none".to_owned()]
         } else {
             [effect.held_out_gain, effect.placebo_p99].map(percent)
         };
@@ -253,11 +255,15 @@ fn left(report: &Report, width: usize, fullness: Fullness) -> Vec<String> {
             .as_ref()
             .map(|location| format!("; largest at {}", place(location)))
             .unwrap_or_default();
+        let follows = if left.explainable_share > 0.0 {
+            format!("{} of its energy follows", percent(left.explainable_share))
+        } else {
+            "no more than chance of it follows".to_owned()
+        };
         let words = format!(
-            "Unexplained in {}: {}; {} of its energy follows the recorded inputs{at}",
+            "Unexplained in {}: {}; {follows} the recorded inputs{at}",
             left.signal,
             quantity(&significant(left.rmse, 3), unit_of(report, &left.signal)),
-            percent(left.explainable_share),
         );
         wrap(&mut lines, &words, 0, width, fullness.notes());
     }

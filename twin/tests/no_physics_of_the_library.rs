@@ -1,0 +1,77 @@
+//! What no effect of the library is gets no name, though one of them may take most of the mismatch. Where the design states no noise, what
+//! the readings change by from one to the next has to tell how much of it is left.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+mod common;
+
+use std::fs;
+
+use common::{noise, said, sensor};
+use twin::model::Model;
+use twin::prepare::{Inputs, Purpose, prepare};
+use twin::report::data::{Report, Verdict};
+
+/// What is said of a state of charge in steps of half a per cent that is corrected once, at 1200 s of 2000 s, by so many points. The
+/// capacity is right.
+fn corrected_once(points: f64, seed: u64) -> Report {
+    let (capacity_ah, initial_soc) = (60.0, 0.9);
+    let mut load_a = noise(seed, 25.0);
+    let (mut charge_c, mut current_a) = (0.0, 30.0);
+    let mut text = "t_s,i_ref_a,soc_pct\n".to_owned();
+    for second in 0..2000 {
+        let before_a = current_a;
+        if second % 20 == 0 {
+            current_a = 30.0 + load_a();
+        }
+        charge_c += 0.5 * (before_a + current_a);
+        let corrected = if second < 1200 { 0.0 } else { points };
+        let soc_pct = 100.0 * (initial_soc - charge_c / 3600.0 / capacity_ah) + corrected;
+        text.push_str(&format!(
+            "{second},{current_a},{}\n",
+            (2.0 * soc_pct).round() / 2.0
+        ));
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let recording = folder.path().join("r.csv");
+    fs::write(&recording, text).unwrap();
+    let model = format!(
+        "schema = 1\n[battery]\ncapacity_ah = {capacity_ah}\ninitial_soc = {initial_soc}\n"
+    );
+    let model = Model::parse("m.toml", model, folder.path()).unwrap();
+    let inputs = Inputs {
+        recording,
+        reference: None,
+        mapping: Vec::new(),
+    };
+    let mut prepared = prepare(&model, &inputs, Purpose::Compare).unwrap();
+    said(prepared.items.remove(0).problem, seed, &[])
+}
+
+#[test]
+fn a_state_of_charge_that_is_corrected_once_is_no_capacity() {
+    for (points, seed) in [(10.0, 1), (7.0, 2), (-5.0, 3), (-8.0, 4)] {
+        let report = corrected_once(points, seed);
+        assert_eq!(report.verdict, Verdict::Unknown, "{points}: {report:?}");
+    }
+}
+
+#[test]
+fn a_dead_sensor_is_clipped_by_nothing() {
+    for (seed, stated_a) in [(1, 0.15), (2, 0.0), (3, 0.15), (4, 0.0)] {
+        let mut load_a = noise(seed, 60.0);
+        let mut reads_a = noise(seed + 100, 0.15);
+        let mut current_a = 0.0;
+        let (t_s, currents): (Vec<f64>, Vec<f64>) = (0..2000)
+            .map(|row| {
+                if row % 10 == 0 {
+                    current_a = load_a();
+                }
+                (0.1 * f64::from(row), current_a)
+            })
+            .unzip();
+        let readings = currents.iter().map(|_| 0.05 + reads_a()).collect();
+        let report = said(sensor(t_s, currents, readings, stated_a), seed, &[]);
+        assert_eq!(report.verdict, Verdict::Unknown, "{seed}: {report:?}");
+    }
+}
