@@ -15,7 +15,7 @@ use crate::{
 /// 32 Mbit.
 pub const CAPACITY: usize = 4 * 1024 * 1024;
 /// The smallest unit that can be erased.
-pub const SECTOR: usize = 4 * 1024;
+pub const SECTOR: u32 = 4 * 1024;
 const PAGE: u32 = 256;
 /// Bytes read back at once.
 const COMPARED: usize = 32;
@@ -125,7 +125,7 @@ impl<SPI: SpiDevice> Flash<SPI> {
     /// bits. One that cannot be read is not.
     pub fn is_begun(&mut self, at: u32) -> bool {
         let is_marked = |byte: u32| (byte & 0xFF).count_ones() <= 4;
-        is_marked(self.word(at) >> 24) && !is_marked(self.word(at + SECTOR as u32 - 4))
+        is_marked(self.word(at) >> 24) && !is_marked(self.word(at + SECTOR - 4))
     }
 
     async fn wait(&mut self, pace: Pace<'_>, limit_ms: u32) -> Result<(), Error<SPI::Error>> {
@@ -195,14 +195,11 @@ impl<SPI: SpiDevice> ReadNorFlash for Lent<'_, SPI> {
 
 impl<SPI: SpiDevice> NorFlash for Lent<'_, SPI> {
     const WRITE_SIZE: usize = 1;
-    const ERASE_SIZE: usize = SECTOR;
+    const ERASE_SIZE: usize = SECTOR as usize;
 
     async fn erase(&mut self, from: u32, to: u32) -> Result<(), Self::Error> {
-        if to > CAPACITY as u32 {
-            return Err(Error::OutOfBounds);
-        }
-        let sector = SECTOR as u32;
-        if from > to || !(from | to).is_multiple_of(sector) {
+        within(to, 0).ok_or(Error::OutOfBounds)?;
+        if from > to || !(from | to).is_multiple_of(SECTOR) {
             return Err(Error::NotAligned);
         }
         let mut at = from;
@@ -213,7 +210,7 @@ impl<SPI: SpiDevice> NorFlash for Lent<'_, SPI> {
                 .write(&command(SECTOR_ERASE, at))
                 .map_err(Error::Bus)?;
             self.0.wait(self.1, ERASE_LIMIT_MS).await?;
-            at += sector;
+            at += SECTOR;
         }
         Ok(())
     }

@@ -31,7 +31,7 @@ use stm32f4xx_hal::{
 
 use crate::{
     flash,
-    flash::{Flash, Lent},
+    flash::{Flash, Lent, SECTOR},
     pace::Pace,
     spi,
 };
@@ -56,9 +56,6 @@ pub struct Counters {
     /// Log records lost.
     pub lost: u32,
 }
-
-#[expect(clippy::cast_possible_truncation, reason = "4 KiB")]
-const SECTOR: u32 = flash::SECTOR as u32;
 
 #[inline(never)]
 fn count(counter: &mut u32) {
