@@ -1,7 +1,8 @@
 //! Two clocks: offset and rate between a sensor's time and its reference's, estimated from the two signals.
 //!
 //! 1. Coarse: cross-correlation of the derivatives on common grids, all offsets at which enough overlaps. Where a current repeats
-//!    itself nearly, noise may lift another peak above the right one: the highest of each grid are compared by their squares.
+//!    itself nearly, noise may lift another peak above the right one: the highest of each grid are compared by their squares,
+//!    with what does not overlap left as it is.
 //! 2. Rate: the best offset of each of several blocks, and a line through them.
 //! 3. Fine: least squares over offset, rate and a smoothing of the reference (a first-order lag or a moving average,
 //!    whichever fits better), with gain and zero solved within. Without the smoothing a lag would be taken for a shift.
@@ -830,21 +831,30 @@ impl Fit<'_> {
                 let noise = smooth.noise(share);
                 let evened = between([self.noise.powi(2), 0.0], share) - noise;
                 cost -= 0.5 * gain * gain * (noise - self.seldom * evened);
-                let residual = (y - zero - gain * x).abs();
-                cost += if residual <= self.huber {
-                    0.5 * residual * residual
-                } else {
-                    self.huber * (residual - 0.5 * self.huber)
-                };
+                cost += self.huber_of(y - zero - gain * x);
             },
         );
         cost / sums.count
+    }
+
+    /// What one residual costs.
+    fn huber_of(&self, residual: f64) -> f64 {
+        let size = residual.abs();
+        if size <= self.huber {
+            0.5 * size * size
+        } else {
+            self.huber * (size - 0.5 * self.huber)
+        }
     }
 
     /// The offset near which the squares are lowest, of some with the step of the grid on which each was found.
     fn likeliest(&self, peaks: &[(f64, f64)], step_s: f64) -> Option<(f64, f64)> {
         let tries = 40;
         let mut best = (f64::INFINITY, None);
+        let rows = self.sensed.t_s.len().max(1) as f64;
+        let mean = self.sensed.value.iter().sum::<f64>() / rows;
+        let apart = self.sensed.value.iter().map(|y| self.huber_of(y - mean));
+        let idle = apart.sum::<f64>() / rows;
         for smoothing in PEAK_SMOOTHINGS {
             let smooth = self.smooth(Shape::Lag, smoothing * step_s);
             for (near_s, grid_s) in peaks {
@@ -854,6 +864,9 @@ impl Fit<'_> {
                     let offset_s =
                         near_s + reach_s * (2.0 * f64::from(index) / f64::from(tries) - 1.0);
                     let cost = self.cost(&smooth, offset_s, 0.0);
+                    // What does not overlap is not accounted for: over a single edge all edges are alike.
+                    let there = self.sums(&smooth.value, offset_s, 0.0, self.all()).count / rows;
+                    let cost = there * cost + (1.0 - there) * idle;
                     if cost < best.0 {
                         best = (cost, Some((*near_s, *grid_s)));
                     }

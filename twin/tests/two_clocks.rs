@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+use std::path::Path;
+
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use twin::align::{Signal, estimate};
@@ -236,4 +238,28 @@ fn two_edges_make_no_rate() {
         let fast_ppm = found.unwrap().fast_ppm;
         assert!(fast_ppm.abs() < 2000.0, "{late_s}: {fast_ppm}");
     }
+}
+
+/// A power sensor that says the mean of the last second beside a load of two edges (recordings/gpu-power-sensor): half a period on, over the
+/// one edge that overlaps, it fits better turned round than over both where they are.
+#[test]
+fn one_edge_turned_round_is_not_where_two_are() {
+    let read = |file: &str, column: &str| {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/gpu-power-sensor");
+        let recording = recording::csv::read(&folder.join(file)).unwrap();
+        let mut last = f64::NAN;
+        let (t_s, value): (Vec<f64>, Vec<f64>) = recording
+            .time_s()
+            .iter()
+            .zip(recording.need(column).unwrap())
+            .filter(|(_, value)| {
+                value.is_finite() && std::mem::replace(&mut last, **value) != **value
+            })
+            .unzip();
+        Signal::new(&t_s, &value, |_| true)
+    };
+    let reference = read("rtx3090-tr-reference.csv", "p_ref_w");
+    let found = estimate(&reference, &read("rtx3090-tr-sensor.csv", "p_meas_w")).unwrap();
+    let late_s = found.on_reference(7.0) - 7.0;
+    assert!(late_s.abs() < 0.2, "{late_s}");
 }
