@@ -198,15 +198,27 @@ fn faults_name_line_key_and_what_was_expected() {
         ),
         (
             "schema = 1\n[sensor]\naccuracy = { zero = nan }\n",
-            &["line 3", "key sensor.accuracy.zero", "a number, zero or more"],
+            &[
+                "line 3",
+                "key sensor.accuracy.zero",
+                "a number, zero or more",
+            ],
         ),
         (
             "schema = 1\n[battery]\ncapacity_ah = 2\naccuracy_v = { gain = -0.01 }\n",
-            &["line 4", "key battery.accuracy_v.gain", "a number, zero or more"],
+            &[
+                "line 4",
+                "key battery.accuracy_v.gain",
+                "a number, zero or more",
+            ],
         ),
         (
             "schema = 1\n[battery]\ncapacity_ah = 2\naccuracy_pct = { zero = nan }\n",
-            &["line 4", "key battery.accuracy_pct.zero", "a number, zero or more"],
+            &[
+                "line 4",
+                "key battery.accuracy_pct.zero",
+                "a number, zero or more",
+            ],
         ),
         (
             "schema = 1\n[sensor]\naverage = 1.5\n",
