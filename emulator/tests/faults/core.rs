@@ -308,6 +308,10 @@ fn fault_f24_a_crystal_that_stops_ends_in_a_reset_with_its_cause() {
         let back_s = until(&mut rig, "a valid current", 1.5, |rig| {
             rig.view.current_a().valid().is_some()
         });
+        // The charge's frame is the next one.
+        until(&mut rig, "a charge", 0.05, |rig| {
+            rig.view.charge_c().value.is_some()
+        });
         let error_c = charge_error_c(&mut rig, before);
         let said: Vec<&String> = rig
             .log
