@@ -42,6 +42,9 @@ const CONFIGURATION: Range<u32> = 0x00_0000..0x00_4000;
 const STATE: Range<u32> = 0x01_0000..0x02_0000;
 const LOG: Range<u32> = 0x20_0000..0x40_0000;
 
+/// So much of the log is looked through in one turn: 32 sectors, 1.5 ms.
+const LOOKED_AT: u32 = 32 * SECTOR;
+
 /// What happened since the start; each stops at its end.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
@@ -131,7 +134,7 @@ impl Storage {
     /// read or written: one that has gone reads as blank.
     pub async fn start(&mut self, pace: Pace<'_>) -> bool {
         let mut result = self.flash.start(pace).await;
-        for region in &[CONFIGURATION, STATE, LOG] {
+        for region in &[CONFIGURATION, STATE] {
             if result.is_err() || self.ready {
                 break;
             }
@@ -355,10 +358,15 @@ impl Storage {
     pub async fn clear_log_sector(&mut self, pace: Pace<'_>) -> Result<bool, ()> {
         // On from the last one, for a worn sector may never look blank.
         let from = core::mem::replace(&mut self.cleared, LOG.start);
-        let at = self.first_written(from..LOG.end);
+        let end = LOG.end.min(from + LOOKED_AT);
+        let at = self.first_written(from..end);
         if at >= LOG.end {
             self.log_full = false;
             return Ok(false);
+        }
+        if at >= end {
+            self.cleared = at;
+            return Ok(true);
         }
         if let Err(value) = Lent(&mut self.flash, pace).erase(at, at + SECTOR).await {
             self.has_failed(&Error::Storage { value });
