@@ -56,13 +56,10 @@ pub(super) fn judge(
         return without_names(bench, selection, before);
     }
     if follows_nothing(bench, selection) {
-        let ids = selection.fit.model.ids().join(", ");
-        selection.refused.push(format!(
-            "{ids}: what they leave of the simulation moves less than what remains beside it: the readings follow nothing, and many things make a sensor dead"
-        ));
-        selection.fit = selection.plain.clone();
-        selection.named.clear();
-        return Verdict::Unknown;
+        return take_back(
+            selection,
+            "what they leave of the simulation moves less than what remains beside it: the readings follow nothing, and many things make a sensor dead",
+        );
     }
     let slips = slipped(bench, &selection.plain, &selection.fit);
     let energy = |residual: &[f64]| without_rows(residual, &slips);
@@ -137,13 +134,10 @@ pub(super) fn judge(
             0.0
         };
         if !confirmed && (ratio > DOUBTFUL || (alike > ALIKE && ratio > TRACES)) {
-            let ids = selection.fit.model.ids().join(", ");
-            selection.refused.push(format!(
-                "{ids}: the best of the library, but so much structure is left, and where these effects act, that the true physics is likely another"
-            ));
-            selection.fit = selection.plain.clone();
-            selection.named.clear();
-            return Verdict::Unknown;
+            return take_back(
+                selection,
+                "the best of the library, but so much structure is left, and where these effects act, that the true physics is likely another",
+            );
         }
         return Verdict::PartlyExplained;
     }
@@ -156,6 +150,15 @@ pub(super) fn judge(
     } else {
         Verdict::Explained
     }
+}
+
+/// Takes all names back, for what speaks against them.
+fn take_back(selection: &mut Selection, why: &str) -> Verdict {
+    let ids = selection.fit.model.ids().join(", ");
+    selection.refused.push(format!("{ids}: {why}"));
+    selection.fit = selection.plain.clone();
+    selection.named.clear();
+    Verdict::Unknown
 }
 
 /// Whether the named effects make a sensor read all but the same all the time: less than a hundredth of the energy with which the

@@ -93,13 +93,13 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
     let mut items = Vec::new();
     for (view, name) in views {
         let value = work.frame.column(name);
+        let cells = cells_of(battery, name);
         let (mut observed, rows) = match &value {
             Some(value) => {
                 checks::some_values(value, name, work.frame.source())?;
                 if work.purpose.compares() {
                     checks::not_constant(value, name, work.frame.source())?;
                 }
-                let cells = cells_of(battery, name);
                 let fresh = held(work, view, found, value, battery.resistance_ohm * cells);
                 if let Some(interval_s) = fresh.interval_s {
                     work.remark(is_held(name, interval_s));
@@ -109,7 +109,6 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             None => (series::every_row(&drive), Arc::clone(&parts.rows)),
         };
         observed.grid = grid(work, name, &observed);
-        let cells = cells_of(battery, name);
         let ocv: Vec<(f64, f64)> = battery
             .ocv
             .iter()

@@ -19,7 +19,8 @@ const AT_REST_V: f64 = 0.010;
 const OF_READING: f64 = 0.005;
 /// No reading is worth less than this uncertainty, 0 … 1: where the open-circuit voltage is flat it tells nothing.
 const WORTH: f64 = 0.3;
-/// What flowed between a reading and a segment's end is off by this share of itself: so much of its capacity a worn cell has lost.
+/// What flowed between a reading and a segment's end is off by this share of itself: so much of its capacity a cell has lost that
+/// is worn (80 % are commonly its end of life).
 const WORN: f64 = 0.2;
 /// A tester's counter is believed over a gap if it has followed the current within this share of the capacity before.
 const COUNTER_SHARE: f64 = 0.02;

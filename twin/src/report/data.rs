@@ -193,6 +193,13 @@ pub struct EffectReport {
     pub consequences: Vec<String>,
 }
 
+impl EffectReport {
+    /// Whether the readings show it by themselves, so that no placebo was asked.
+    pub fn is_shown_by_readings(&self) -> bool {
+        self.placebo_p99 == 0.0
+    }
+}
+
 /// A file that was never fitted.
 #[derive(Clone, Debug, Serialize)]
 pub struct HoldoutReport {

@@ -387,7 +387,7 @@ fn evidence(page: &mut String, effect: &EffectReport) {
         ));
         return;
     }
-    if effect.placebo_p99 == 0.0 {
+    if effect.is_shown_by_readings() {
         page.push_str(&format!(
             "<p>The readings show it by themselves, and it is <strong>{}</strong> of the squared error that is left without it, on all samples. \
              No sample was left out for it and no placebo asked.</p>\n",

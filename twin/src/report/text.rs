@@ -169,7 +169,7 @@ fn effects(report: &Report, width: usize, fullness: Fullness) -> Vec<String> {
         let mut parameters = parameters.into_iter();
         let [gain, placebos] = if effect.by_place.is_some() {
             ["by place".to_owned(), String::new()]
-        } else if effect.placebo_p99 == 0.0 {
+        } else if effect.is_shown_by_readings() {
             [percent(effect.held_out_gain), "none".to_owned()]
         } else {
             [effect.held_out_gain, effect.placebo_p99].map(percent)
