@@ -527,9 +527,9 @@ fn received(random: &mut Random, message: &Message, counter: u8) -> (Frame, Sign
         .iter()
         .filter(|signal| signal.field.start >= 16)
     {
-        let raw = match signal.field.not_available {
+        let raw = match signal.field.not_available() {
             Some(not_available) if random.next().is_multiple_of(6) => not_available,
-            _ => random.within(signal.field.minimum, signal.field.maximum),
+            _ => random.within(signal.field.minimum(), signal.field.maximum),
         };
         word = signal.field.put(word, raw);
         signals.push((signal.name.to_string(), physical(raw, signal.scale)));
@@ -616,9 +616,8 @@ fn find(message: &Message, name: &str) -> Option<(Field, Scale)> {
             start: code.number(),
             length: 1,
             signed: false,
-            minimum: 0,
             maximum: 1,
-            not_available: None,
+            has_not_available: false,
         };
         return Some((
             field,

@@ -62,9 +62,9 @@ impl Word {
 
     /// A value, or "not available".
     fn with_optional(self, field: Field, raw: Option<i64>) -> Self {
-        match (raw, field.not_available) {
+        match (raw, field.not_available()) {
             (None, Some(not_available)) => self.with(field, not_available),
-            (raw, _) => self.with_clamped(field, raw.unwrap_or(field.minimum)),
+            (raw, _) => self.with_clamped(field, raw.unwrap_or(field.minimum())),
         }
     }
 
@@ -710,7 +710,7 @@ const VEHICLE_STATE: ReceiverConfig = receiver_config(layout::vehicle_state::DAT
 /// Reads one signal of message `id`: a number, `None` for "not available".
 fn read(id: u16, data: Payload, field: Field) -> Result<Option<i64>, ReceiveError> {
     let raw = field.get(layout::word(data));
-    if Some(raw) == field.not_available {
+    if Some(raw) == field.not_available() {
         Ok(None)
     } else if field.holds(raw) {
         Ok(Some(raw))
@@ -1771,7 +1771,7 @@ mod tests {
             prop_assert_eq!(field.get(after), value);
             let mask = ((1u128 << field.length) - 1) as u64;
             prop_assert_eq!(after & !(mask << field.start), before & !(mask << field.start));
-            if let Some(not_available) = field.not_available {
+            if let Some(not_available) = field.not_available() {
                 prop_assert!(!field.holds(not_available));
                 prop_assert_eq!(field.get(field.put(before, not_available)), not_available);
             }
@@ -1821,7 +1821,7 @@ mod tests {
                 for signal in message.signals.iter().filter(|signal| signal.page.is_none() || signal.page == page) {
                     let raw = signal.field.get(word(frame.data));
                     prop_assert!(
-                        signal.field.holds(raw) || signal.field.not_available == Some(raw),
+                        signal.field.holds(raw) || signal.field.not_available() == Some(raw),
                         "{} {}", signal.name, raw
                     );
                 }

@@ -41,7 +41,7 @@ pub struct CompareConfig {
     pub slow_window_ms: u32,
     /// Share by which the channels may differ.
     pub gain_tolerance: Ppm,
-    /// Current by which they may differ at any reading.
+    /// Current by which they may differ at any reading. A front end of one sensor has that of the large one.
     pub zero_tolerance: PerRange<Microamps>,
     /// Share of a window that usable conversions and the short gaps between them must cover.
     pub covered_share: Ppm,

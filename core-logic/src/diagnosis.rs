@@ -119,7 +119,7 @@ diagnoses! {
         "network output below the open threshold: 0.15 V open, lowest legal output from the front end (D3; `OpenSensorConfig`)";
         0 ms, 1000 ms, Error, WhileActive, [OPEN] [OPEN] [OPEN]
     1 SensorRail: "The sensor's output is stuck at ground or at its supply.",
-        "beyond the front end's output limits for two conversions (`OpenSensorConfig`)";
+        "half-way between the end of the sensor's range and the rail (D0: 0.125 / 4.875 V), or the like level on the network, two readings (`OpenSensorThresholds`)";
         0 ms, 1000 ms, Error, WhileActive, [OPEN] [OPEN] [OPEN]
     2 SensorSaturated: "The selected sensor is at the end of its range.",
         "front end's output limits: 0.25 / 4.75 V (D0), 0.5 / 4.5 V (D2)";
@@ -140,10 +140,10 @@ diagnoses! {
         "rate limit in A/s (`ConverterConfig`)";
         0 ms, 100 ms, Warning, WhileActive, [IMPLAUSIBLE] [] []
     8 MeterNoAnswer: "The ADE7753 cannot be read: every retry failed.",
-        "two polls of 20 ms (`METER_POLL_MS`)";
+        "no reading for 100 ms, or the chip does not take its configuration";
         40 ms, 500 ms, Error, WhileActive, [] [CHIP_FAULT] [CHIP_FAULT]
     9 MeterDeadBus: "The ADE7753's MODE or DIEREV reads back wrong: its bus is stuck.",
-        "two periodic read-backs";
+        "one turn of the read-back, its register read twice";
         0 ms, 500 ms, Error, WhileActive, [] [CHIP_FAULT] [CHIP_FAULT]
     10 MeterChecksum: "Reads of the ADE7753 fail their checksum too often.",
         "retries per second above the limit of the meter's owner";
@@ -179,7 +179,7 @@ diagnoses! {
         "stability, current and time limits (`KeyCalibrationConfig`)";
         0 ms, 0 ms, Warning, UntilCleared, [] [] []
     21 HvWithoutPermit: "High voltage is on without this board's permit.",
-        "feedback input against permit output";
+        "feedback on, permit withheld for longer than the feedback grace (`KeyCalibrationConfig`)";
         100 ms, 100 ms, Critical, UntilCleared, [] [] []
     22 SupplyCalibrationInvalid: "The front end needs supply relations (D4) and has none.",
         "limits of the supply relations";
@@ -188,7 +188,7 @@ diagnoses! {
         "limit of the zero drift (`ZeroDriftConfig`)";
         1000 ms, 1000 ms, Error, WhileActive, [IMPLAUSIBLE] [IMPLAUSIBLE] [IMPLAUSIBLE]
     24 SocUncertain: "The state of charge is less certain than its limit.",
-        "uncertainty limit (`SocConfig`)";
+        "half-width above 10 % of the capacity (`SOC_UNCERTAINTY_LIMIT`, no setting)";
         1000 ms, 10000 ms, Warning, WhileActive, [] [] [IMPLAUSIBLE]
     25 CellVoltageMissing: "No cell voltage received, or only as not available, so the state of charge cannot be re-anchored.",
         "500 ms (`CAN_RECEIVE_TIMEOUT_MS`)";
@@ -227,7 +227,7 @@ diagnoses! {
         "retained panic record";
         0 ms, 0 ms, Error, UntilCleared, [] [] []
     37 BrownOutReset: "The last reset came from the supply without an orderly power-off.",
-        "reset cause and retained state";
+        "reset flags: brown-out without power-on";
         0 ms, 0 ms, Info, UntilCleared, [] [] []
     38 StackHighWater: "Less stack has stayed free than the reserve.",
         "reserve of the firmware's stack check";

@@ -1,7 +1,7 @@
 //! D4's correction by vehicle state: factors k and a from the sensor's output at 0 A with key OFF and with key ACC,
 //! and the permit for the high voltage, which waits for them.
 //!
-//! - Key **OFF**, high voltage off: output VC1, `k = VOUT0 / VC1` with VOUT0 the rated zero output.
+//! - Key **OFF**, high voltage off: output VC1, `k = VOUT0 / VC1` with VOUT0 the rated zero output, which the front end's settings have.
 //! - Key **ACC**, low-voltage loads on, high voltage still off: output VC2, `a = VC1 − VC2`.
 //! - Running: `k·(V + a)`, which is exactly VOUT0, that is 0 A, at V = VC2.
 //!
@@ -18,13 +18,13 @@
 //!
 //! A board that starts while the key is not OFF and the high voltage is on (a reset on the road) permits at once:
 //! to withdraw the permit would open the contactors under load. Until its first step the pin floats or is low all the
-//! same, up to 0.5 s: bridging that is the off-delay's business that docs/firmware.md demands of what the permit drives.
+//! same, up to 0.5 s (0.95 s after a loss of power): bridging that is the off-delay's business that docs/firmware.md
+//! demands of what the permit drives.
 
 use core::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::design_parameters::SENSOR_ZERO;
 use crate::front_end::KeyFactors;
 use crate::range::Range;
 use crate::units::{
@@ -64,9 +64,6 @@ pub enum OnFailure {
 pub struct KeyCalibrationConfig {
     /// Whether factors are taken at all; if not, the permit follows the key without a delay.
     pub enabled: bool,
-    /// VOUT0, the rated output at 0 A, of a sensor whose output is referred to the rated supply. D4's own sensor has
-    /// its second relation for that.
-    pub rated_zero: Microvolts,
     /// Samples that are averaged, at least 1.
     pub samples: u16,
     /// Time after a change of key or high voltage before samples count.
@@ -96,7 +93,6 @@ impl Default for KeyCalibrationConfig {
     fn default() -> Self {
         Self {
             enabled: true,
-            rated_zero: SENSOR_ZERO,
             // At 32 conversions a second: half a second.
             samples: 16,
             settle_ms: 200,
@@ -592,6 +588,7 @@ fn milliseconds(milliseconds: u32) -> Duration {
 )]
 mod tests {
     use super::*;
+    use crate::design_parameters::SENSOR_ZERO;
     use crate::design_parameters::{D4_EXAMPLE_ACC, D4_EXAMPLE_OFF};
     use crate::front_end::FrontEnd;
     use proptest::prelude::*;
@@ -754,10 +751,7 @@ mod tests {
         let config = KeyCalibrationConfig::default();
         let batch_ms = u32::from(config.samples) * 1_000 / 32;
         assert!(config.settle_ms + 2 * batch_ms <= config.max_delay_ms);
-        assert_eq!(
-            (config.rated_zero, config.on_failure),
-            (SENSOR_ZERO, OnFailure::PermitWithPrevious)
-        );
+        assert_eq!(config.on_failure, OnFailure::PermitWithPrevious);
         let mut car = after_off(config);
         car.calibration.off_output = Some(D4_EXAMPLE_OFF);
         car.calibration.off_zero = SENSOR_ZERO;
@@ -1279,7 +1273,6 @@ mod tests {
         ) {
             let config = KeyCalibrationConfig {
                 enabled: wild.0,
-                rated_zero: Microvolts(wild.1),
                 samples: wild.2,
                 settle_ms: wild.3 % 3,
                 max_delay_ms: wild.4,

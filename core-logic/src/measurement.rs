@@ -3,7 +3,7 @@
 //! ```text
 //! on_conversion, on_converter_fault ┐
 //! on_meter                          ├─→ Measurement ─→ current(), charge(), … frames of `can`
-//! on_environment, on_cell_voltage   │               ├─→ fill(Readings) for `modbus`
+//! on_environment, on_battery_voltage┤               ├─→ fill(Readings) for `modbus`
 //! tick (10 ms)                      ┘               └─→ retained(), log_record()
 //! ```
 //!
@@ -23,7 +23,9 @@ use crate::converter::{
 };
 use crate::design_parameters as design;
 use crate::diagnosis::{Changes, Code, CodeSet, Diagnosis, Effects};
-use crate::front_end::{Channel, FrontEnd, KeyFactors, PerRange, SupplyRelations};
+use crate::front_end::{
+    Channel, FrontEnd, KeyFactors, PerRange, SupplyRelations, network_output_nanovolts,
+};
 use crate::gap::{self, Gap, GapBridge};
 use crate::key_calibration::{
     KeyCalibration, KeyInputs, KeyOutputs, KeyPhase, KeyRefusal, KeySample, KeyState,
@@ -326,8 +328,8 @@ pub struct Measurement {
 /// With `I = (k·(V + a) − V0)·G − zero` the meter, which sees `(V − V0)·G`, reads the true current divided by k, and
 /// at 0 A it reads what a sensor output of `(V0 + zero/G)/k − a` gives.
 ///
-/// The level shift in front of channel 1 is half the sensor's supply, so a ratiometric sensor's zero cancels and its
-/// sensitivity follows the supply: the correction is 5 V / Vc.
+/// The level shift in front of channel 1 is half the sensor's supply, or the network's own zero (D3). A ratiometric sensor's output
+/// follows the supply with it: the correction is 5 V / Vc, and what its zero is away from 2.5 V stays as an offset.
 #[must_use]
 pub fn effective_meter_config(
     configuration: &Configuration,
@@ -343,11 +345,11 @@ pub fn effective_meter_config(
     let one = i64::from(Ppm::ONE.get());
     for range in [Range::Small, Range::Large] {
         let line = configuration.front_end.line(range, supply);
-        // Share by which the reading has to be multiplied.
-        let (supply_factor, shift_error) = match configuration.front_end {
+        // Share by which the reading has to be multiplied, and the level shift as the front end's signal has it, in nV.
+        let (supply_factor, level) = match configuration.front_end {
             FrontEnd::DualRange(_) | FrontEnd::Hah1bv(_) => (
                 mul_div(one, i64::from(nominal.get()), i64::from(supply.get())),
-                0,
+                i64::from(nominal.get()) * 500,
             ),
             FrontEnd::ClosedLoop(_) => {
                 let rated = configuration.front_end.line(range, nominal);
@@ -356,11 +358,10 @@ pub fn effective_meter_config(
                     rated.denominator,
                     rated.numerator,
                 );
-                // nV between the sensor's zero and the level shift of Vc/2.
-                (factor, line.zero_nanovolts - i64::from(supply.get()) * 500)
+                (factor, i64::from(supply.get()) * 500)
             }
-            // Its sensor runs from ±15 V and its level shift is the network's reference.
-            FrontEnd::Network(_) => (one, 0),
+            // Its sensor runs from ±15 V.
+            FrontEnd::Network(_) => (one, network_output_nanovolts(0)),
         };
         let factors = if range == KeyCalibration::RANGE || !configuration.front_end.has_two_ranges()
         {
@@ -380,7 +381,11 @@ pub fn effective_meter_config(
         );
         let input_at_zero = sub_i64(scaled, i64::from(factors.a.get()));
         let sensor_zero_at_zero = line.current(Microvolts(clamp_i32(input_at_zero))).get();
-        let shift = mul_div(shift_error, line.numerator, line.denominator);
+        let shift = mul_div(
+            line.zero_nanovolts - level,
+            line.numerator,
+            line.denominator,
+        );
         let offset = add_i64(i64::from(sensor_zero_at_zero), shift);
         let gain = mul_div(
             mul_div(
@@ -536,11 +541,7 @@ impl Measurement {
     /// The active configuration is another one: factors are worked out anew, nothing measured is lost. The meter's
     /// owner has to be handed [`Measurement::meter_config`] as well.
     pub fn configuration_changed(&mut self, configuration: &Configuration) {
-        let Prepared {
-            converter,
-            soc: before,
-            ..
-        } = self.prepared;
+        let converter = self.prepared.converter;
         if self.key_factors_set != configuration.key_factors {
             self.key_factors_set = configuration.key_factors;
             self.key.set_factors(configuration.key_factors);
@@ -560,9 +561,7 @@ impl Measurement {
             self.open_sensor = OpenSensor::new();
             self.flag = self.flag_plausibility.rest();
         }
-        if before.capacity() != self.prepared.soc.capacity() {
-            self.soc.change_capacity(&before, &self.prepared.soc);
-        }
+        self.soc.change_capacity(&self.prepared.soc);
         self.soc_reading = self.soc.reading(&self.prepared.soc);
     }
 
@@ -820,10 +819,7 @@ impl Measurement {
                     .map(|at| (at, self.meter.charge_total)),
                 sample: (self.conversions > 0).then_some(KeySample {
                     voltage: measured.then(|| self.reading.volts.saturating_sub(drift)),
-                    zero: match configuration.front_end {
-                        FrontEnd::ClosedLoop(_) => zero,
-                        _ => configuration.key_calibration.rated_zero,
-                    },
+                    zero,
                     range: self.reading.range,
                     at: self.reading.at,
                 }),
@@ -1072,7 +1068,12 @@ impl Measurement {
                 started,
                 finished: reading.at,
                 current: reading.current,
-                range: reading.range,
+                // One sensor alone is as coarse as the large one of two: the tolerance is that of its range.
+                range: if configuration.front_end.has_two_ranges() {
+                    reading.range
+                } else {
+                    Range::Large
+                },
                 usable: reading.validity.is_valid(),
             },
         );

@@ -605,7 +605,10 @@ mod tests {
     fn each_input_register_reads_its_quantity() {
         let mut board = Board::new();
         board.readings = readings();
-        assert_eq!(board.read(4, 0x0000, 4), Ok([0x0100, 1, 2, 3].to_vec()));
+        assert_eq!(
+            board.read(4, 0x0000, 4),
+            Ok([super::readings::MAP_VERSION, 1, 2, 3].to_vec())
+        );
         assert_eq!(board.read(4, 0x0006, 6), Ok([0, 10, 0, 11, 0, 12].to_vec()));
         assert_eq!(
             board.read(4, 0x000C, 1),

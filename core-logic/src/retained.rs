@@ -23,12 +23,12 @@ pub const SLOT_BYTES: usize = 96;
 /// Words of one slot.
 pub const SLOT_WORDS: usize = SLOT_BYTES / 4;
 /// Longest flash record of a [`RetainedState`].
-pub const MAX_STATE_BYTES: usize = 86;
+pub const MAX_STATE_BYTES: usize = 91;
 /// Longest flash record of a [`LogRecord`].
 pub const MAX_LOG_BYTES: usize = 64;
 
-/// First byte of a retained state: kind 0xA, version 1.
-const STATE: u8 = 0xA1;
+/// First byte of a retained state: kind 0xA, version 2.
+const STATE: u8 = 0xA2;
 /// First byte of a log record: kind 0x5, version 2.
 const LOG: u8 = 0x52;
 
@@ -419,6 +419,7 @@ mod tests {
             sequence: u32::MAX,
             charge_total: Nanocoulombs(i64::MIN),
             soc: SocRetained {
+                capacity_mah: u32::MAX,
                 remaining: Nanocoulombs(i64::MIN),
                 presented_offset: Nanocoulombs(i64::MIN),
                 uncertainty: Nanocoulombs(i64::MIN),
@@ -452,13 +453,14 @@ mod tests {
 
     prop_compose! {
         fn any_state()(
-            sequence: u32, charges in proptest::array::uniform6(any::<i64>()), known: bool, loss_carry: u32,
+            sequence: u32, capacity_mah: u32, charges in proptest::array::uniform6(any::<i64>()), known: bool, loss_carry: u32,
             k_ppb: i32, a: i32,
         ) -> RetainedState {
             RetainedState {
                 sequence,
                 charge_total: Nanocoulombs(charges[0]),
                 soc: SocRetained {
+                    capacity_mah,
                     remaining: Nanocoulombs(charges[1]),
                     presented_offset: Nanocoulombs(charges[2]),
                     uncertainty: Nanocoulombs(charges[3]),
@@ -566,7 +568,7 @@ mod tests {
         let next_version = sealed(&[STATE + 1, 0, 0, 0]);
         assert_eq!(
             RetainedState::decode(&next_version),
-            Err(RetainedError::Kind(0xA2))
+            Err(RetainedError::Kind(STATE + 1))
         );
         assert_eq!(
             RetainedState::decode(&sealed(&[STATE, 1])),

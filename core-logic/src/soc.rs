@@ -239,6 +239,9 @@ pub struct SocInput {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct SocRetained {
+    /// The capacity that the charges belong to, in mAh; 0 is none, and they are taken as they are. The settings may come back with another
+    /// one: those of another version, or not saved.
+    pub capacity_mah: u32,
     /// Charge that can still be discharged, 0 … capacity.
     pub remaining: Nanocoulombs,
     /// Presented minus estimated charge, on its way to 0.
@@ -341,6 +344,7 @@ impl Soc {
     pub fn new(coefficients: &SocCoefficients) -> Self {
         Self::with(
             SocRetained {
+                capacity_mah: coefficients.config.capacity_mah,
                 remaining: Nanocoulombs(coefficients.capacity / 2),
                 uncertainty: Nanocoulombs(coefficients.capacity),
                 ..SocRetained::default()
@@ -350,24 +354,25 @@ impl Soc {
     }
 
     /// Goes on after a reset. `charge_total` is the meter's counter that was saved together with `kept`: what the
-    /// counter gained since is counted with the first update. Values that do not fit the capacity are taken at its ends.
+    /// counter gained since is counted with the first update. Another capacity is taken over as [`Soc::change_capacity`] does; values that do
+    /// not fit it are taken at its ends.
     #[must_use]
     pub fn restore(
         coefficients: &SocCoefficients,
         kept: &SocRetained,
         charge_total: Nanocoulombs,
     ) -> Self {
-        let inside =
-            |charge: Nanocoulombs| Nanocoulombs(charge.get().clamp(0, coefficients.capacity));
         let positive = |charge: Nanocoulombs| Nanocoulombs(charge.get().max(0));
         let kept = SocRetained {
-            remaining: inside(kept.remaining),
-            uncertainty: inside(kept.uncertainty),
             charged: positive(kept.charged),
             discharged: positive(kept.discharged),
             ..*kept
         };
         let mut soc = Self::with(kept, Some(charge_total));
+        soc.change_capacity(coefficients);
+        for charge in [&mut soc.kept.remaining, &mut soc.kept.uncertainty] {
+            charge.0 = charge.get().clamp(0, coefficients.capacity);
+        }
         soc.keep_presented_inside(coefficients);
         soc
     }
@@ -412,17 +417,21 @@ impl Soc {
 
     /// Takes over another capacity. The state of charge stays, the charge scales: what changes a capacity is that the
     /// battery has aged or was measured anew, and a full one is still full.
-    pub fn change_capacity(&mut self, old: &SocCoefficients, new: &SocCoefficients) {
+    pub fn change_capacity(&mut self, coefficients: &SocCoefficients) {
+        let new = coefficients.config.capacity_mah;
+        let old = core::mem::replace(&mut self.kept.capacity_mah, new);
+        if old == new || old == 0 {
+            return;
+        }
+        let scaled = |charge| mul_div(charge, i64::from(new), i64::from(old));
         for charge in [
             &mut self.kept.remaining,
             &mut self.kept.presented_offset,
             &mut self.kept.uncertainty,
         ] {
-            charge.0 = mul_div(charge.get(), new.capacity, old.capacity);
+            charge.0 = scaled(charge.get());
         }
-        self.anchored_at = self
-            .anchored_at
-            .map(|after| mul_div(after, new.capacity, old.capacity));
+        self.anchored_at = self.anchored_at.map(scaled);
     }
 
     /// Integrates up to `input.now`, and once a second looks after uncertainty and rest.
@@ -1338,6 +1347,7 @@ mod tests {
         let coefficients = SocCoefficients::new(&config());
         let full = 36_000 * COULOMB;
         let kept = SocRetained {
+            capacity_mah: config().capacity_mah,
             remaining: Nanocoulombs(2 * full),
             presented_offset: Nanocoulombs(full),
             uncertainty: Nanocoulombs(-1),
@@ -1350,6 +1360,7 @@ mod tests {
         assert_eq!(
             restored,
             SocRetained {
+                capacity_mah: config().capacity_mah,
                 remaining: Nanocoulombs(full),
                 presented_offset: Nanocoulombs::ZERO,
                 uncertainty: Nanocoulombs::ZERO,
@@ -1385,7 +1396,7 @@ mod tests {
             capacity_mah: 8_000,
             ..config()
         });
-        bench.soc.change_capacity(&bench.coefficients, &aged);
+        bench.soc.change_capacity(&aged);
         let after = bench.soc.reading(&aged);
         assert!((after.estimate.get() - before.estimate.get()).abs() <= 1);
         assert!((after.presented.get() - before.presented.get()).abs() <= 1);
@@ -1396,9 +1407,31 @@ mod tests {
             capacity_mah: 1_000_000,
             ..config()
         });
-        bench.soc.change_capacity(&aged, &bench.coefficients);
+        bench.soc.change_capacity(&bench.coefficients);
         bench.rest(600);
         assert_eq!(bench.reading().anchors, before.anchors);
+    }
+
+    proptest! {
+        /// Settings that come back with another capacity than the state was saved with: those of another version, or not saved. A full
+        /// battery is still full, and back again.
+        #[test]
+        fn another_capacity_at_a_restart_keeps_the_state_of_charge(
+            before_mah in 1_000_u32..2_000_000, after_mah in 1_000_u32..2_000_000, soc_ppm in 0..=1_000_000_i32,
+            total: i32,
+        ) {
+            let of = |capacity_mah| SocCoefficients::new(&SocConfig { capacity_mah, ..config() });
+            let (before, after) = (of(before_mah), of(after_mah));
+            let total = Nanocoulombs(i64::from(total) << 20);
+            let mut soc = Soc::new(&before);
+            soc.set(&before, Ppm(soc_ppm), Ppm(5_000));
+            let restored = Soc::restore(&after, &soc.retained(), total);
+            let reading = restored.reading(&after);
+            prop_assert!((reading.estimate.get() - soc_ppm).abs() <= 1, "{:?}", reading);
+            prop_assert!((reading.uncertainty.get() - 5_000).abs() <= 1, "{:?}", reading);
+            let back = Soc::restore(&before, &restored.retained(), total).reading(&before);
+            prop_assert!((back.estimate.get() - soc_ppm).abs() <= 2, "{:?}", back);
+        }
     }
 
     #[test]
@@ -1576,7 +1609,7 @@ mod tests {
         #[test]
         fn no_input_panics_and_the_ends_hold(
             capacity_mah: u32, efficiency: i32, others in proptest::array::uniform8(any::<i32>()),
-            times in proptest::array::uniform4(any::<u32>()), kept_values in proptest::array::uniform5(any::<i64>()),
+            times in proptest::array::uniform5(any::<u32>()), kept_values in proptest::array::uniform5(any::<i64>()),
             steps in proptest::collection::vec((any::<u64>(), any::<i64>(), any::<Option<i32>>(), any::<Option<(i32, u64)>>()), 1..20),
         ) {
             let wild = SocConfig {
@@ -1596,6 +1629,7 @@ mod tests {
             };
             let coefficients = SocCoefficients::new(&wild);
             let kept = SocRetained {
+                capacity_mah: times[4],
                 remaining: Nanocoulombs(kept_values[0]),
                 presented_offset: Nanocoulombs(kept_values[1]),
                 uncertainty: Nanocoulombs(kept_values[2]),

@@ -62,9 +62,8 @@ fn signals(message: &Message) -> Vec<(String, Field, Scale, Option<u8>)> {
                     start: code.number(),
                     length: 1,
                     signed: false,
-                    minimum: 0,
+                    has_not_available: false,
                     maximum: 1,
-                    not_available: None,
                 };
                 (format!("{prefix}{code:?}"), field, plain, None)
             })
@@ -184,7 +183,7 @@ fn code_and_dbc_have_the_same_signals() {
             );
             let physical = |raw: i64| raw as f64 * factor + scale.offset as f64;
             assert!(
-                close(number(their.min), physical(field.minimum)),
+                close(number(their.min), physical(field.minimum())),
                 "{name} {:?}",
                 their.min
             );
@@ -200,7 +199,7 @@ fn code_and_dbc_have_the_same_signals() {
                 .iter()
                 .find(|value| value.description == NOT_AVAILABLE)
                 .map(|value| value.id);
-            assert_eq!(not_available, field.not_available, "{name}");
+            assert_eq!(not_available, field.not_available(), "{name}");
             let expected = match page {
                 Some(page) => MultiplexIndicator::MultiplexedSignal(u64::from(page)),
                 None if paged => MultiplexIndicator::Multiplexor,
@@ -264,9 +263,9 @@ fn signals_fit_do_not_overlap_and_are_described() {
                 (0, (1i64 << field.length) - 1)
             };
             let held = [
-                Some(field.minimum),
+                Some(field.minimum()),
                 Some(field.maximum),
-                field.not_available,
+                field.not_available(),
             ];
             assert!(
                 held.into_iter()

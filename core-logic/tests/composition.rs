@@ -14,7 +14,9 @@ use core_logic::configuration::Configuration;
 use core_logic::converter::{ConverterSample, SupplyMode};
 use core_logic::design_parameters as design;
 use core_logic::diagnosis::{Code, CodeSet};
-use core_logic::front_end::{ClosedLoop, FrontEnd, Hah1bv, KeyFactors, Network, SupplyRelations};
+use core_logic::front_end::{
+    ClosedLoop, DualRange, FrontEnd, Hah1bv, KeyFactors, Network, SupplyRelations,
+};
 use core_logic::key_calibration::{KeyPhase, KeyState};
 use core_logic::measurement::{
     ConverterFault, Environment, Found, Measurement, Order, Refusal, Tick, Vehicle,
@@ -193,6 +195,9 @@ fn with_front_end(front_end: FrontEnd) -> Configuration {
     configuration
 }
 
+/// D3's network at a Hall output of 0 V, in V.
+const NETWORK_ZERO_V: f64 = 1.65;
+
 /// Counts per second that the meter makes for a voltage at the switch's output and a level shift, both in volts.
 fn counts_per_second(signal_v: f64, shift_v: f64) -> f64 {
     let full_scale = design::METER_COUNTS_PER_SECOND_Q32 as f64 / 2f64.powi(32);
@@ -203,17 +208,24 @@ proptest! {
     /// Whatever is known about the sensor - drift, key factors, supply - the meter's charge is what flowed.
     #[test]
     fn the_meter_counts_with_everything_that_is_known_about_the_sensor(
-        kind in 0..3,
+        kind in 0..4,
         supply_v in 4.6f64..5.4,
+        zero_error_v in -0.02f64..0.02,
         current_a in -50.0f64..50.0,
         drift_a in -3.0f64..3.0,
         k in 0.99f64..1.01,
         a_v in -0.03f64..0.03,
         large: bool,
     ) {
+        let error = Microvolts((zero_error_v * 1e6) as i32);
+        let zero_error_v = f64::from(error.get()) * 1e-6;
         let front_end = match kind {
-            0 => FrontEnd::default(),
+            0 => FrontEnd::DualRange(DualRange {
+                zero: design::SENSOR_ZERO.saturating_add(error),
+                ..DualRange::default()
+            }),
             1 => FrontEnd::Hah1bv(Hah1bv::default()),
+            2 => FrontEnd::Network(Network { sensor_zero: error, ..Network::default() }),
             _ => FrontEnd::ClosedLoop(closed_loop()),
         };
         let mut configuration = with_front_end(front_end);
@@ -238,7 +250,13 @@ proptest! {
                     (0, Range::Large) => 2.25 / 600.0,
                     _ => 0.004,
                 };
-                ((2.5 + sensed * per_amp) / k - a_v) * supply_v / 5.0
+                let zero_v = if kind == 0 { 2.5 + zero_error_v } else { 2.5 };
+                ((zero_v + sensed * per_amp) / k - a_v) * supply_v / 5.0
+            }
+            // Its sensor runs from ±15 V, and the level shift is what the network has at a Hall output of 0 V.
+            2 => {
+                let per_amp = f64::from(Network::default().sensor_nanovolts_per_amp) * 1e-9;
+                (NETWORK_ZERO_V + 0.225 * (zero_error_v + sensed * per_amp)) / k - a_v
             }
             _ => {
                 let relations = closed_loop().relations;
@@ -249,7 +267,8 @@ proptest! {
                 (impedance * sensed / f64::from(closed_loop().turns) + zero) / k - a_v
             }
         };
-        let rate = counts_per_second(output_v, supply_v / 2.0);
+        let level_v = if kind == 2 { NETWORK_ZERO_V } else { supply_v / 2.0 };
+        let rate = counts_per_second(output_v, level_v);
         let mut channel = MeterChannel::new(config);
         for second in 0..=100u64 {
             let us = second * 1_000_000;

@@ -241,7 +241,7 @@ fn d3_finds_the_open_small_sensor_and_marks_the_current() {
         core_logic::can::layout::current::VALUE.get(core_logic::can::layout::word(frame.data));
     assert_eq!(
         Some(raw),
-        core_logic::can::layout::current::VALUE.not_available
+        core_logic::can::layout::current::VALUE.not_available()
     );
 }
 
@@ -458,6 +458,7 @@ proptest! {
         let retained = RetainedState {
             charge_total: Nanocoulombs::from_coulombs(total_c),
             soc: SocRetained {
+                capacity_mah: configuration.soc.capacity_mah,
                 remaining: Nanocoulombs::from_coulombs(remaining_c),
                 charged: Nanocoulombs::from_coulombs(charged_c),
                 discharged: Nanocoulombs::from_coulombs(discharged_c),

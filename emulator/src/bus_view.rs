@@ -134,7 +134,7 @@ impl BusView {
             .find(|candidate| candidate.name == signal)?;
         let (_, payload) = self.payloads.get(&u32::from(message.header.id))?;
         let raw = signal.field.get(layout::word(*payload));
-        if signal.field.not_available == Some(raw) {
+        if signal.field.not_available() == Some(raw) {
             return None;
         }
         let scale = signal.scale;

@@ -238,7 +238,7 @@ impl Center {
         let environment = Environment {
             supply: readings.supply,
             network: readings.network,
-            sensor_temperature: link.temperature,
+            sensor_temperature: link.temperature.filter(|_| link.health.counting),
             board_temperature: readings.temperature,
             controller_supply: readings
                 .vdda

@@ -19,7 +19,7 @@ use crate::time;
 const TRANSACTION_LIMIT_US: u32 = 1_500;
 /// Half a clock of the recovery: 100 kHz, which every slave can follow.
 const RECOVERY_HALF_CLOCK_US: u32 = 4;
-/// A slave holds SDA for at most eight bits and the acknowledge.
+/// A slave holds SDA for at most eight bits in a row and the acknowledge.
 const RECOVERY_CLOCKS: u8 = 9;
 
 /// APB1, which clocks the peripheral.
@@ -104,7 +104,11 @@ impl Bus {
         self.i2c.cr1().write(|w| w.pe().set_bit());
     }
 
-    /// Frees a slave that holds SDA in the middle of a byte: up to nine clocks, a stop, the peripheral reset. 0.1 ms.
+    /// Frees a slave that is in the middle of a byte: up to nine clocks, each with a stop in it, the peripheral reset. 0.1 ms.
+    ///
+    /// Each clock brings the slave's next bit. One that is 1 leaves SDA to the master, and a stop in that same clock ends the
+    /// transfer; after a clock more the next bit may hold SDA again. No clock is made beyond the first stop, and in none SDA stays high:
+    /// a slave that was being written to takes nothing for a byte.
     ///
     /// # Errors
     /// [`Error::Timeout`] if a line is still low afterwards: a short or a slave without end.
@@ -112,24 +116,17 @@ impl Bus {
         let Self { clock, data, .. } = self;
         let free = clock.with_open_drain_output_in_state(PinState::High, |clock| {
             data.with_open_drain_output_in_state(PinState::High, |data| {
-                for _ in 0..RECOVERY_CLOCKS {
-                    if data.is_high() {
-                        break;
-                    }
+                (0..RECOVERY_CLOCKS).any(|_| {
                     clock.set_low();
+                    data.set_low();
                     time::delay_us(RECOVERY_HALF_CLOCK_US);
                     clock.set_high();
                     time::delay_us(RECOVERY_HALF_CLOCK_US);
-                }
-                // A stop: SDA rises while SCL is high.
-                clock.set_low();
-                data.set_low();
-                time::delay_us(RECOVERY_HALF_CLOCK_US);
-                clock.set_high();
-                time::delay_us(RECOVERY_HALF_CLOCK_US);
-                data.set_high();
-                time::delay_us(RECOVERY_HALF_CLOCK_US);
-                clock.is_high() && data.is_high()
+                    // Where the slave lets it, SDA rises while SCL is high: a stop.
+                    data.set_high();
+                    time::delay_us(RECOVERY_HALF_CLOCK_US);
+                    clock.is_high() && data.is_high()
+                })
             })
         });
         self.configure();

@@ -98,6 +98,8 @@ pub struct Meter {
     verify_turn: u8,
     /// MODE.TEMPSEL at the last read-back.
     converting: bool,
+    /// Since the chip was last configured, and not fetched yet.
+    temperature_asked: bool,
     window: (Option<Instant>, u8),
     health: Health,
 }
@@ -118,6 +120,7 @@ impl Meter {
             gap: false,
             verify_turn: 0,
             converting: false,
+            temperature_asked: false,
             window: (None, 0),
             health: Health::default(),
         }
@@ -356,6 +359,7 @@ impl Meter {
 
     /// About 20 transfers, 0.6 ms. Nothing is counted meanwhile, so an edge has nothing to be handed over either.
     fn configure(&mut self, now: Instant) {
+        self.temperature_asked = false;
         match self.chip.configure(&configuration()) {
             Ok(()) => {
                 self.state = State::Counting;
@@ -379,16 +383,20 @@ impl Meter {
     /// Starts a conversion of the chip's temperature sensor. To be called right after a read-back of MODE: one write
     /// with its verification, 65 µs, the longest of the steps.
     pub fn start_temperature(&mut self) {
-        let _ = self.chip.write(Mode {
-            start_temperature: true,
-            ..configuration().mode()
-        });
+        self.temperature_asked = self
+            .chip
+            .write(Mode {
+                start_temperature: true,
+                ..configuration().mode()
+            })
+            .is_ok();
     }
 
     /// The temperature, if the conversion has finished by the last read-back of MODE. It may never: parts of this
     /// family wait for a zero crossing of channel 2, which a constant has not.
     pub fn temperature(&mut self) -> Option<MilliCelsius> {
-        if self.converting {
+        // A reset since then has cleared the register and the request.
+        if self.converting || !core::mem::take(&mut self.temperature_asked) {
             return None;
         }
         let Temp(code) = self.chip.read::<Temp>().ok()?;

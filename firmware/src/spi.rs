@@ -67,56 +67,65 @@ where
         });
         Self { spi, select }
     }
+}
 
-    fn byte(&mut self, out: u8) -> Result<u8, Error> {
-        self.spi.dr().write(|w| w.dr().set(u16::from(out)));
-        if !time::wait_until(BYTE_LIMIT_US, || self.spi.sr().read().rxne().bit_is_set()) {
-            return Err(Error::Timeout);
-        }
-        let status = self.spi.sr().read();
-        let [received, _] = self.spi.dr().read().dr().bits().to_le_bytes();
-        if status.ovr().bit_is_set() {
-            return Err(Error::Overrun);
-        }
-        Ok(received)
+fn byte(spi: &spi1::RegisterBlock, out: u8) -> Result<u8, Error> {
+    spi.dr().write(|w| w.dr().set(u16::from(out)));
+    if !time::wait_until(BYTE_LIMIT_US, || spi.sr().read().rxne().bit_is_set()) {
+        return Err(Error::Timeout);
     }
+    let status = spi.sr().read();
+    let [received, _] = spi.dr().read().dr().bits().to_le_bytes();
+    if status.ovr().bit_is_set() {
+        return Err(Error::Overrun);
+    }
+    Ok(received)
+}
 
-    fn operation(&mut self, operation: &mut Operation<'_, u8>) -> Result<(), Error> {
-        match operation {
-            Operation::Read(bytes) => {
-                for byte in bytes.iter_mut() {
-                    *byte = self.byte(0)?;
-                }
+fn carry_out(spi: &spi1::RegisterBlock, operation: &mut Operation<'_, u8>) -> Result<(), Error> {
+    match operation {
+        Operation::Read(bytes) => {
+            for received in bytes.iter_mut() {
+                *received = byte(spi, 0)?;
             }
-            Operation::Write(bytes) => {
-                for byte in bytes.iter() {
-                    self.byte(*byte)?;
-                }
-            }
-            Operation::Transfer(read, write) => {
-                let length = read.len().max(write.len());
-                for index in 0..length {
-                    let received = self.byte(write.get(index).copied().unwrap_or(0))?;
-                    if let Some(byte) = read.get_mut(index) {
-                        *byte = received;
-                    }
-                }
-            }
-            Operation::TransferInPlace(bytes) => {
-                for byte in bytes.iter_mut() {
-                    *byte = self.byte(*byte)?;
-                }
-            }
-            Operation::DelayNs(ns) => time::delay_us(ns.div_ceil(1_000)),
         }
-        Ok(())
+        Operation::Write(bytes) => {
+            for sent in bytes.iter() {
+                byte(spi, *sent)?;
+            }
+        }
+        Operation::Transfer(read, write) => {
+            let length = read.len().max(write.len());
+            for index in 0..length {
+                let received = byte(spi, write.get(index).copied().unwrap_or(0))?;
+                if let Some(place) = read.get_mut(index) {
+                    *place = received;
+                }
+            }
+        }
+        Operation::TransferInPlace(bytes) => {
+            for place in bytes.iter_mut() {
+                *place = byte(spi, *place)?;
+            }
+        }
+        Operation::DelayNs(ns) => time::delay_us(ns.div_ceil(1_000)),
     }
+    Ok(())
+}
 
-    /// Back to a known state after an error: a byte left over must not be taken for the next one's answer.
-    fn flush(&mut self) {
-        let _ = self.spi.dr().read();
-        let _ = self.spi.sr().read();
+/// All of a transaction but the chip select; once in the image for both buses.
+#[inline(never)]
+fn carry_out_all(
+    spi: &spi1::RegisterBlock,
+    operations: &mut [Operation<'_, u8>],
+) -> Result<(), Error> {
+    let mut result = operations
+        .iter_mut()
+        .try_for_each(|operation| carry_out(spi, operation));
+    if !time::wait_until(BYTE_LIMIT_US, || spi.sr().read().bsy().bit_is_clear()) {
+        result = result.and(Err(Error::Timeout));
     }
+    result
 }
 
 impl<SPI, CS> ErrorType for Device<SPI, CS> {
@@ -131,15 +140,12 @@ where
     fn transaction(&mut self, operations: &mut [Operation<'_, u8>]) -> Result<(), Error> {
         // The pin is a GPIO output, which cannot fail.
         let _ = self.select.set_low();
-        let mut result = operations
-            .iter_mut()
-            .try_for_each(|operation| self.operation(operation));
-        if !time::wait_until(BYTE_LIMIT_US, || self.spi.sr().read().bsy().bit_is_clear()) {
-            result = result.and(Err(Error::Timeout));
-        }
+        let result = carry_out_all(&self.spi, operations);
         let _ = self.select.set_high();
         if result.is_err() {
-            self.flush();
+            // A byte left over must not be taken for the next one's answer.
+            let _ = self.spi.dr().read();
+            let _ = self.spi.sr().read();
         }
         result
     }

@@ -49,15 +49,35 @@ pub struct Field {
     pub length: u8,
     /// Two's complement.
     pub signed: bool,
-    /// Least raw number with a meaning.
-    pub minimum: i64,
+    /// One raw number says "not available": [`Field::not_available`].
+    pub has_not_available: bool,
     /// Greatest raw number with a meaning.
     pub maximum: i64,
-    /// Raw number that says "not available".
-    pub not_available: Option<i64>,
 }
 
+/// What follows from the rest is worked out: each signal's `Field` is in the image.
 impl Field {
+    /// Least raw number with a meaning: the greatest one's negative, or 0.
+    #[must_use]
+    pub const fn minimum(self) -> i64 {
+        if self.signed { -self.maximum } else { 0 }
+    }
+
+    /// Raw number that says "not available": the least that a signed signal can hold, the greatest of an unsigned one.
+    #[must_use]
+    pub const fn not_available(self) -> Option<i64> {
+        let raw = if self.signed {
+            -(1 << (self.length - 1))
+        } else {
+            self.mask().cast_signed()
+        };
+        if self.has_not_available {
+            Some(raw)
+        } else {
+            None
+        }
+    }
+
     const fn mask(self) -> u64 {
         (1 << self.length) - 1
     }
@@ -84,8 +104,8 @@ impl Field {
     /// The nearest raw number with a meaning.
     #[must_use]
     pub const fn clamp(self, raw: i64) -> i64 {
-        if raw < self.minimum {
-            self.minimum
+        if raw < self.minimum() {
+            self.minimum()
         } else if raw > self.maximum {
             self.maximum
         } else {
@@ -96,7 +116,7 @@ impl Field {
     /// Whether the raw number has a meaning, "not available" apart.
     #[must_use]
     pub const fn holds(self, raw: i64) -> bool {
-        raw >= self.minimum && raw <= self.maximum
+        raw >= self.minimum() && raw <= self.maximum
     }
 }
 
@@ -161,6 +181,18 @@ macro_rules! is_signed {
     };
 }
 
+const fn is_stated(not_available: Option<i64>) -> bool {
+    not_available.is_some()
+}
+
+/// The numbers of the table below, as the DBC has them, are those that [`Field`] works out.
+const fn check(field: Field, minimum: i64, not_available: Option<i64>) {
+    assert!(field.minimum() == minimum);
+    if let (Some(stated), Some(follows)) = (not_available, field.not_available()) {
+        assert!(stated == follows);
+    }
+}
+
 macro_rules! messages {
     ($($(#[$doc:meta])* $module:ident $name:literal = $id:literal, $direction:ident, $cycle:literal ms + $phase:literal ms
         $(, data id $data_id:literal)? $(, codes $prefix:literal)? {
@@ -190,10 +222,10 @@ macro_rules! messages {
                         start: $start,
                         length: $length,
                         signed: is_signed!($sign),
-                        minimum: $minimum,
+                        has_not_available: is_stated(optional!($($sna)?)),
                         maximum: $maximum,
-                        not_available: optional!($($sna)?),
                     };
+                    const _: () = check($field, $minimum, optional!($($sna)?));
                 )*
                 /// With names and scales.
                 pub const MESSAGE: Message = Message {

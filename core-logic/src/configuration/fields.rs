@@ -388,7 +388,6 @@ fields! {
 
     0x0400 U16 1 Standstill (0, 1) "key calibration: enabled" "" "0 off, 1 on" [at key_calibration.enabled];
     0x0401 U16 1 Standstill (0, 1) "key calibration: on failure" "" "0 permit with the previous factors, 1 hold the permit" [at key_calibration.on_failure];
-    0x0402 I32 1 Standstill (1_000_000, 4_000_000) "key calibration: rated zero" "µV" "VOUT0, the rated output at 0 A; a closed loop has k2·Vc + m2 in its place" [at key_calibration.rated_zero];
     0x0404 U16 1 Standstill (1, 1_024) "key calibration: samples" "" "that are averaged" [at key_calibration.samples];
     0x0406 U32 1 Standstill (0, 10_000) "key calibration: settling" "ms" "after a change of key or high voltage" [at key_calibration.settle_ms];
     0x0408 U32 1 Standstill (100, 60_000) "key calibration: longest delay" "ms" "of the high-voltage permit" [at key_calibration.max_delay_ms];
@@ -436,7 +435,7 @@ fields! {
     0x0640 U32 1 Always (100, 60_000) "channels: fast window" "ms" "over which meter and converter are compared" [at compare.fast_window_ms];
     0x0642 U32 1 Always (100, 600_000) "channels: slow window" "ms" "the same with the finer bound; longer than the fast one" [at compare.slow_window_ms];
     0x0644 I32 1 Always (0, 500_000) "channels: gain tolerance" "ppm" "share by which they may differ" [at compare.gain_tolerance];
-    0x0646 I32 2 Always (0, 100_000_000) "channels: zero tolerance" "µA" "by which they may differ at any reading; small, large sensor" [ranges compare.zero_tolerance];
+    0x0646 I32 2 Always (0, 100_000_000) "channels: zero tolerance" "µA" "by which they may differ at any reading; small, large sensor, which is that of a single one too" [ranges compare.zero_tolerance];
     0x064A I32 1 Always (100_000, 1_000_000) "channels: covered share" "ppm" "of a window that usable conversions must cover" [at compare.covered_share];
     0x064C U32 1 Always (10, 10_000) "channels: short gap" "ms" "longest gap between usable conversions that is bridged" [at compare.short_gap_ms];
 

@@ -6,7 +6,7 @@ use crate::units::{Microamps, Microvolts, MilliCelsius, Millivolts, Nanocoulombs
 use crate::validity::Validity;
 
 /// Version of the register map: the upper byte counts incompatible changes, the lower one additions.
-pub const MAP_VERSION: u16 = 0x0100;
+pub const MAP_VERSION: u16 = 0x0200;
 
 /// The calibration under way.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -190,7 +190,7 @@ readings! {
     can_counters: [u32; 6],
     /// RS485: as `modbus_rtu::Counters`, in its order.
     rs485_counters: [u32; 9],
-    /// Flash: records written, erases, write errors, CRC errors, log records lost.
+    /// Flash: records written, sectors erased by *clear log*, failed writes and erases, refused records, log records lost.
     flash_counters: [u32; 5],
 }
 
@@ -301,7 +301,7 @@ inputs! {
     0x0028 U32 1 "configuration generation" "" "changes of the active configuration since the start" |r, _| r.configuration_generation.into();
     0x002A U32 1 "configuration CRC" "" "CRC-32 of the active configuration" |r, _| r.configuration_crc.into();
     0x002C U16 1 "configuration saved" "" "1 when flash holds the active configuration" |r, _| r.configuration_saved.into();
-    0x002D U16 1 "flash busy" "" "1 while a client's save, restore, defaults or clear log is under way" |r, _| r.storage_busy.into();
+    0x002D U16 1 "flash busy" "" "1 while a client's save, restore or clear log is under way" |r, _| r.storage_busy.into();
 
     // Current.
     0x0040 I32 1 "current" "mA" "of the last conversion, positive is discharge" |r, _| r.current.to_milliamps().into();
@@ -360,5 +360,5 @@ inputs! {
     0x0110 U32 5 "converter counters" "" "bus errors, bus recoveries, lost configurations, missed conversions, invalid samples" |r, i| element(&r.converter_counters, i);
     0x0120 U32 6 "CAN counters" "" "sent, received, dropped, E2E failures, bus-off, error counters (transmit·256 + receive)" |r, i| element(&r.can_counters, i);
     0x0130 U32 9 "RS485 counters" "" "messages, communication errors, exceptions, messages for this server, no responses, character overruns, busy, missed, character gaps" |r, i| element(&r.rs485_counters, i);
-    0x0148 U32 5 "flash counters" "" "records written, erases, write errors, CRC errors, log records lost" |r, i| element(&r.flash_counters, i);
+    0x0148 U32 5 "flash counters" "" "records written, sectors erased by *clear log* (not those the queues erase), failed writes and erases, refused records, log records lost" |r, i| element(&r.flash_counters, i);
 }
