@@ -498,6 +498,11 @@ impl Outside for Board {
         self.i2c_bus.take_spurious_bus_error()
     }
 
+    fn i2c_abandoned(&mut self, clocked: u8, at: Ticks) {
+        self.see(at.seconds());
+        self.i2c_bus.abandon(clocked, at, &mut self.converter);
+    }
+
     fn i2c_lines(&mut self, at: Ticks) -> (bool, bool) {
         self.i2c_bus.lines(at)
     }

@@ -31,7 +31,7 @@ const REFUSED: u8 = 0x80;
 const BUSY: u8 = 0x06;
 /// A request that stays without an answer is sent so often, as masters do on a line with noise.
 const ATTEMPTS: u32 = 3;
-/// Boot takes 0.2 s, and the board answers after half a second.
+/// A start takes up to 0.45 s until the board answers.
 const BOOT_S: f64 = 0.8;
 /// Time between two looks at something that takes its time, and how often it is looked at: 10 s.
 const PACE: Ticks = Ticks::from_millis(20);

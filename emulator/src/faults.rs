@@ -92,7 +92,7 @@ pub const CATALOGUE: [Entry; 24] = [
     entry(
         "F11",
         "the I²C bus fails",
-        "sda (held in the middle of a byte), nack, arbitration, glitch, spurious (a bus error that is none) or short, how long the short (100ms)",
+        "sda (held in the middle of a byte), byte (in the middle of one whose bits alternate), nack, arbitration, glitch, spurious (a bus error that is none) or short, how long the short (100ms)",
     ),
     entry("F12", "the ADS1100 is reset", "none"),
     entry(
@@ -132,7 +132,7 @@ pub const CATALOGUE: [Entry; 24] = [
     ),
     entry(
         "F20",
-        "a bit of every flash page of the state is worn out",
+        "bits of every flash page of the state are worn out",
         "none",
     ),
     entry("F21", "the supply fails and comes back", "none"),
@@ -557,6 +557,14 @@ impl Fault {
                 let short = I2cFault::SdaLow(Some(given.length(0.1)));
                 let words = [
                     ("sda", I2cFault::HoldSda { clocks: 9 }),
+                    // Zeros and ones by turns: a stop that takes a clock of its own after a one has been seen finds a zero.
+                    (
+                        "byte",
+                        I2cFault::MidByte {
+                            byte: 0x55,
+                            shown: 0,
+                        },
+                    ),
                     ("nack", I2cFault::NackAddresses(3)),
                     ("arbitration", I2cFault::LoseArbitration(1)),
                     ("glitch", I2cFault::Glitch),
@@ -807,8 +815,10 @@ impl Fault {
             }
             Self::FlashWear => on_board(rig, |board| {
                 for page in STATE_PAGES {
-                    // The header of the first item; it is written in each sector.
-                    board.flash.wear_out(page * 256 + 9, 0x55);
+                    // In each record, wherever it begins: at one place alone what is written may have ones there anyway.
+                    for at in (9..256).step_by(64) {
+                        board.flash.wear_out(page * 256 + at, 0x55);
+                    }
                 }
             }),
             Self::PowerLoss => rig.power_cycle(),

@@ -47,6 +47,13 @@ pub enum I2cFault {
         /// 1 … 9.
         clocks: u8,
     },
+    /// The slave is in the middle of a byte that it sends, and nobody clocks it: what a reset of the MCU leaves behind.
+    MidByte {
+        /// The byte, most significant bit first.
+        byte: u8,
+        /// The bit (0 = first) that stands on SDA.
+        shown: u8,
+    },
     /// SDA is shorted low, for a time or for ever.
     SdaLow(Option<Ticks>),
     /// SCL is shorted low, for a time or for ever.
@@ -69,6 +76,8 @@ pub enum Ending {
     ArbitrationLost,
     /// A start or stop at the wrong place.
     BusError,
+    /// The master was reset.
+    Abandoned,
 }
 
 /// One address phase and the bytes that followed.
@@ -111,6 +120,33 @@ impl Short {
     }
 }
 
+/// A slave in the middle of a byte that it sends (UM10204, 3.1.5 and 3.1.6): each falling edge of SCL brings the next bit; with the
+/// ninth clock it looks whether it was acknowledged, and only then goes on. Start and stop end it anywhere.
+#[derive(Clone, Copy, Debug)]
+struct Sending {
+    byte: u8,
+    /// 0 … 7; 8 is the acknowledge bit, for which it lets go of SDA.
+    shown: u8,
+}
+
+impl Sending {
+    const fn is_low(self) -> bool {
+        self.shown < 8 && self.byte & 0x80 >> self.shown == 0
+    }
+
+    fn clock_falls(&mut self) {
+        if self.shown < 8 {
+            self.shown += 1;
+        } else {
+            // Acknowledged, or it would have stopped: beyond its third byte the ADS1100 sends 0xFF.
+            *self = Self {
+                byte: 0xFF,
+                shown: 0,
+            };
+        }
+    }
+}
+
 /// The bus.
 #[derive(Debug, Default)]
 pub struct I2cBus {
@@ -123,6 +159,7 @@ pub struct I2cBus {
     hold_in_byte: Option<u8>,
     /// Falling edges of SCL until the slave lets go of SDA.
     held: Option<u8>,
+    sending: Option<Sending>,
     sda_short: Short,
     scl_short: Short,
     glitch: bool,
@@ -167,6 +204,7 @@ impl I2cBus {
         self.spurious_bus_errors = 0;
         self.hold_in_byte = None;
         self.held = None;
+        self.sending = None;
         self.sda_short = Short::default();
         self.scl_short = Short::default();
         self.glitch = false;
@@ -189,6 +227,7 @@ impl I2cBus {
                 I2cFault::SpuriousBusErrors(count) => self.spurious_bus_errors += count,
                 I2cFault::HoldSdaInByte { clocks } => self.hold_in_byte = Some(clocks),
                 I2cFault::HoldSda { clocks } => self.held = (clocks > 0).then_some(clocks),
+                I2cFault::MidByte { byte, shown } => self.sending = Some(Sending { byte, shown }),
                 I2cFault::SdaLow(length) => self.sda_short = Short::new(from, length),
                 I2cFault::SclLow(length) => self.scl_short = Short::new(from, length),
                 I2cFault::Glitch if self.started => self.bus_errors += 1,
@@ -202,7 +241,10 @@ impl I2cBus {
     }
 
     fn sda_low(&self, at: Ticks) -> bool {
-        self.held.is_some() || self.sda_short.is_low(at) || at < self.other_master_until
+        self.held.is_some()
+            || self.sending.is_some_and(Sending::is_low)
+            || self.sda_short.is_low(at)
+            || at < self.other_master_until
     }
 
     /// SCL falls: a slave that lost step shifts on.
@@ -210,6 +252,14 @@ impl I2cBus {
         if let Some(left) = self.held {
             self.held = left.checked_sub(1).filter(|left| *left > 0);
         }
+        if let Some(sending) = &mut self.sending {
+            sending.clock_falls();
+        }
+    }
+
+    /// SCL rises: with the ninth clock a slave that sends is acknowledged by a low SDA, or has ended.
+    fn clock_rises(&mut self, sda: bool) {
+        self.sending = self.sending.filter(|sending| sending.shown < 8 || !sda);
     }
 
     /// Whether the peripheral takes the event that has just ended for a bus error, and is wrong ([`I2cFault::SpuriousBusErrors`]).
@@ -249,6 +299,8 @@ impl I2cBus {
         }
         if !scl_was && scl_is {
             self.clock_pulses += 1;
+            let sda = self.levels_with_pins(at).1;
+            self.clock_rises(sda);
         }
         let sda_before = if scl_was == scl_is {
             sda_was
@@ -260,6 +312,7 @@ impl I2cBus {
         if scl_is && !sda_before && sda_is {
             self.pin_stops += 1;
             self.stop_owed = true;
+            self.sending = None;
             self.close(at, Ending::Stop);
         }
     }
@@ -298,6 +351,18 @@ impl I2cBus {
         }
     }
 
+    /// The master is reset in the middle of a byte that the slave sends, after so many of its bits.
+    pub fn abandon(&mut self, clocked: u8, at: Ticks, device: &mut dyn I2cDevice) {
+        // In the ninth clock nobody acknowledges any more.
+        if self.selected && clocked < 8 {
+            self.sending = Some(Sending {
+                byte: device.read(at.seconds()),
+                shown: clocked,
+            });
+        }
+        self.close(at, Ending::Abandoned);
+    }
+
     fn note_byte(&mut self, byte: u8, acknowledged: bool) {
         if let Some(last) = self
             .log
@@ -320,6 +385,7 @@ impl I2cBus {
             self.clock_falls();
             let low = strike.is_some() && bit >= STRUCK_BIT || self.sda_low(at);
             let mask = 0x80 >> bit;
+            self.clock_rises(!low && byte & mask != 0);
             if low && byte & mask != 0 {
                 if from_master {
                     self.held = strike.or(self.held);
@@ -331,6 +397,7 @@ impl I2cBus {
         }
         self.clock_falls();
         let acknowledged = strike.is_some() || self.sda_low(at);
+        self.clock_rises(!acknowledged);
         self.held = strike.or(self.held);
         self.selected = in_step;
         Ok((seen, acknowledged))
@@ -354,6 +421,9 @@ impl I2cBus {
             self.selected = false;
             self.close(at, Ending::BusError);
             return I2cAnswer::BusError;
+        }
+        if needs_sda {
+            self.sending = None;
         }
         match event {
             I2cEvent::Start => {
@@ -722,6 +792,52 @@ mod tests {
                 I2cAnswer::Byte(seen as u8)
             );
             prop_assert_eq!(bus.levels(Ticks(2)), (true, true));
+        }
+
+        /// A slave in the middle of a byte shows bit after bit, and is free at the first clock with a 1 in which a stop is made. A
+        /// stop that takes a clock of its own after the 1 was seen finds the next bit.
+        #[test]
+        fn a_slave_in_the_middle_of_a_byte_shows_its_bits(byte: u8, shown in 0_u8..8) {
+            let bits: Vec<bool> = (shown..8).map(|bit| byte & 0x80 >> bit != 0).collect();
+            let at = Ticks(1);
+            let inject = || {
+                let mut bus = I2cBus::new();
+                bus.inject(I2cFault::MidByte { byte, shown });
+                bus
+            };
+            let mut bus = inject();
+            for bit in &bits {
+                prop_assert_eq!(bus.levels(at).1, *bit);
+                bus.pins(LOW, None, at);
+                bus.pins(None, None, at);
+            }
+            // Not acknowledged: it has ended, whatever is clocked.
+            prop_assert_eq!(bus.levels(at).1, true);
+            prop_assert!(bus.sending.is_none());
+
+            // Acknowledged by whoever pulls SDA in the ninth clock: it goes on.
+            let mut bus = inject();
+            for _ in &bits {
+                bus.pins(LOW, LOW, at);
+                bus.pins(None, LOW, at);
+            }
+            bus.pins(LOW, LOW, at);
+            bus.pins(LOW, None, at);
+            bus.pins(None, None, at);
+            prop_assert!(bus.sending.is_some());
+
+            let stop = |bus: &mut I2cBus| {
+                for (scl, sda) in [(LOW, None), (LOW, LOW), (None, LOW), (None, None)] {
+                    bus.pins(scl, sda, at);
+                }
+                bus.sending.is_none()
+            };
+            // The clock of the stop brings the bit after the one that stands there.
+            let mut bus = inject();
+            let clocks = (1..=9).find(|_| stop(&mut bus));
+            let first = bits.iter().skip(1).position(|bit| *bit).unwrap_or(bits.len() - 1);
+            prop_assert_eq!(clocks, Some(first + 1));
+            prop_assert_eq!(bus.pin_stops(), 1);
         }
     }
 }

@@ -158,6 +158,8 @@ pub trait Outside {
     fn i2c_spurious_bus_error(&mut self) -> bool {
         false
     }
+    /// I²C1 was reset and lets go of the lines, `clocked` bits into a byte that it was receiving.
+    fn i2c_abandoned(&mut self, _clocked: u8, _at: Ticks) {}
     /// Levels of SCL and SDA as seen by the MCU's pins, when it does not pull them itself.
     fn i2c_lines(&mut self, at: Ticks) -> (bool, bool);
     /// The voltage at ADC1's external input `channel` (0 … 15), in V.

@@ -36,13 +36,16 @@ pub fn install(packages: &[&str]) -> Result<()> {
             Way::Root => Command::new("apt-get"),
             Way::Sudo => {
                 let mut sudo = Command::new("sudo");
-                sudo.args(["-n", "apt-get"]);
+                // What is set for `sudo` itself does not reach what it runs.
+                sudo.args(["-n", "env", "DEBIAN_FRONTEND=noninteractive", "apt-get"]);
                 sudo
             }
         };
         command
             .env("DEBIAN_FRONTEND", "noninteractive")
             .args(["-q", "-o", "Dpkg::Use-Pty=0"])
+            // Another run, or the system's own, may be at it.
+            .args(["-o", "DPkg::Lock::Timeout=600"])
             .args(arguments);
         process::run_to_stderr(&mut command)
     };

@@ -118,6 +118,7 @@ enum Phase {
         decide: Option<Ticks>,
         ack: bool,
         end: Ticks,
+        bit: Ticks,
     },
     /// DR and shift register full: SCL low until DR is read.
     ReceiverFull,
@@ -350,6 +351,7 @@ impl I2c {
             decide: Some(at + clock.bits(8)),
             ack: false,
             end: at + clock.bits(9),
+            bit: clock.bits(1),
         };
     }
 
@@ -511,6 +513,7 @@ impl I2c {
                     decide: None,
                     ack,
                     end,
+                    bit: clock.bits(1),
                 }
             }
             Some(I2cAnswer::ArbitrationLost) => self.lose_arbitration(),
@@ -557,7 +560,23 @@ impl I2c {
         }
     }
 
-    fn software_reset(&mut self, value: u16) {
+    /// A reset lets go of the lines. The slave knows nothing of it: one that sends goes on showing its bit.
+    fn abandon(&self, context: &mut Context<'_>) {
+        let clocked = match self.phase {
+            Phase::Receiving { end, bit, .. } => {
+                let left = end.since(context.now).0.div_ceil(bit.0);
+                9_u64.saturating_sub(left).min(8) as u8
+            }
+            // The first bit of the next byte stands on SDA while SCL is held low.
+            Phase::ReceiverFull => 0,
+            Phase::AddressDone if !self.transmitter => 0,
+            _ => return,
+        };
+        context.outside.i2c_abandoned(clocked, context.now);
+    }
+
+    fn software_reset(&mut self, value: u16, context: &mut Context<'_>) {
+        self.abandon(context);
         *self = Self::new();
         self.cr1 = value;
     }
@@ -565,7 +584,7 @@ impl I2c {
     fn write_cr1(&mut self, value: u16, context: &mut Context<'_>) -> Result<(), Unmodelled> {
         if value & SWRST != 0 {
             // Everything is held in reset; the lines are let go of.
-            self.software_reset(SWRST);
+            self.software_reset(SWRST, context);
             return Ok(());
         }
         REGISTERS.refuse(CR1, value, CR1_REFUSED)?;
@@ -765,6 +784,7 @@ impl Peripheral for I2c {
                 Phase::Receiving {
                     decide: Some(_),
                     end,
+                    bit,
                     ..
                 } => {
                     let ack = if self.cr1 & POS != 0 {
@@ -776,6 +796,7 @@ impl Peripheral for I2c {
                         decide: None,
                         ack,
                         end,
+                        bit,
                     };
                 }
                 Phase::Receiving { ack, end, .. } => self.finish_read(ack, end, clock, context),
@@ -787,6 +808,7 @@ impl Peripheral for I2c {
     }
 
     fn reset(&mut self, context: &mut Context<'_>) {
+        self.abandon(context);
         *self = Self::new();
         self.update_interrupts(context);
     }

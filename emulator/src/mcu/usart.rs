@@ -4,7 +4,7 @@
 //! clearing sequence, the idle frame after TE, baud rates, interrupts. Not modelled, and an error where the software
 //! asks for it: other formats than 8E1, OVER8, RWU, SBK, LIN, smartcard, IrDA, single wire, flow control, DMA.
 //!
-//! SR followed by DR clears a flag that rose between the two, as with the other peripherals of this make. A character
+//! SR followed by DR clears the flags that SR showed; an overrun that comes between the two stays, without RXNE (30.3.3, overrun error). A character
 //! whose start bit came before the receiver was on is missed as a whole.
 
 use super::halfword::{Registers, periods};
@@ -79,8 +79,8 @@ pub struct Usart {
     brr: u16,
     cr1: u16,
     cr3: u16,
-    /// SR was read: reading DR clears PE, FE, NF, ORE and IDLE.
-    read_for_receive: bool,
+    /// What SR showed when it was read: reading DR clears PE, FE, NF, ORE and IDLE of it.
+    read_for_receive: u16,
     /// SR was read: writing DR clears TC.
     read_for_send: bool,
     to_send: Option<u8>,
@@ -105,7 +105,7 @@ impl Usart {
             brr: 0,
             cr1: 0,
             cr3: 0,
-            read_for_receive: false,
+            read_for_receive: 0,
             read_for_send: false,
             to_send: None,
             shifting: None,
@@ -294,7 +294,7 @@ impl Peripheral for Usart {
         self.advance(context);
         let value = match index {
             SR => {
-                self.read_for_receive = true;
+                self.read_for_receive = self.status;
                 self.read_for_send = true;
                 self.status
             }
@@ -304,9 +304,8 @@ impl Peripheral for Usart {
                     self.longest_wait = self.longest_wait.max(wait);
                 }
                 self.status &= !RXNE;
-                if std::mem::take(&mut self.read_for_receive) {
-                    self.status &= !(PE | FE | NF | ORE | IDLE);
-                }
+                let shown = std::mem::take(&mut self.read_for_receive);
+                self.status &= !(shown & (PE | FE | NF | ORE | IDLE));
                 self.received
             }
             BRR => self.brr,
@@ -557,6 +556,20 @@ mod tests {
         hear(&mut bench, Character::good(5));
         bench.write(SR, !u32::from(RXNE) & 0xFFFF);
         assert!(bench.interrupts.is_asserted(38));
+    }
+
+    #[test]
+    fn an_overrun_between_the_two_reads_stays() {
+        let mut bench = port();
+        hear(&mut bench, Character::good(1));
+        assert_eq!(bench.read(SR) & u32::from(RXNE | ORE), u32::from(RXNE));
+        bench.run(CHARACTER);
+        hear(&mut bench, Character::good(2));
+        assert_eq!(bench.read(DR) & 0xFF, 1);
+        assert!(bench.interrupts.is_asserted(38));
+        assert_eq!(bench.read(SR) & u32::from(RXNE | ORE), u32::from(ORE));
+        bench.read(DR);
+        assert_eq!(bench.read(SR) & u32::from(RXNE | ORE), 0);
     }
 
     #[test]

@@ -2,8 +2,10 @@
 
 use emulator::bus_view::validity;
 use emulator::i2c_bus::{Ending, Transaction};
+use emulator::mcu::rcc::ResetCause;
 use emulator::rig::{Rig, Setup};
 use emulator::scenario::{Contactors, Scenario};
+use emulator::time::Ticks;
 
 use crate::bench::*;
 
@@ -16,7 +18,7 @@ fn conversions(rig: &Rig<'_>) -> f64 {
 
 #[test]
 fn fault_f11_the_i2c_bus_is_recovered_and_what_is_old_is_marked() {
-    for fault in ["sda", "nack", "arbitration", "glitch"] {
+    for fault in ["sda", "byte", "nack", "arbitration", "glitch"] {
         let mut rig = steady(40.0);
         rig.run_s(0.5).unwrap();
         let recovered = counters(&mut rig, 0x0110, 2);
@@ -99,6 +101,56 @@ fn fault_f11_the_i2c_bus_is_recovered_and_what_is_old_is_marked() {
     assert!(back_s <= 0.6, "{back_s}");
     let error_a = rig.view.meter_current_a().valid().unwrap() - 40.0;
     assert!(error_a.abs() < 0.1, "the meter went on: {error_a}");
+}
+
+/// A reset finds the converter at any bit of a read, and it goes on showing that bit: one recovery frees it.
+#[test]
+fn fault_f11_a_reset_in_the_middle_of_a_read_costs_one_recovery() {
+    let mut rig = steady(40.0);
+    // The image looks for the chip at another address first.
+    let looked_for = counters(&mut rig, 0x0110, 1)[0];
+    let (mut held, mut worst_s) = (0, 0_f64);
+    for bytes in 0..3 {
+        for bit in 0..9 {
+            rig.run_s(0.4).unwrap();
+            let reading = |board: &mut emulator::board::Board| {
+                board.i2c_bus.log().last().is_some_and(|transfer| {
+                    transfer.end.is_none()
+                        && transfer.address.is_some_and(|address| address & 1 == 1)
+                        && transfer.acknowledged
+                        && transfer.bytes.len() == bytes
+                })
+            };
+            let begin = rig.machine.now();
+            while !board(&mut rig, reading) {
+                assert!(rig.machine.now().since(begin).seconds() < 0.1);
+                rig.run_for(Ticks::from_micros(1)).unwrap();
+            }
+            // A bit takes 2.5 µs.
+            rig.run_for(Ticks::from_seconds(2.5e-6 * f64::from(bit) + 1e-6))
+                .unwrap();
+            rig.machine.reset(ResetCause::IndependentWatchdog);
+            rig.view.first_valid_current = None;
+            let now = rig.machine.now();
+            held += usize::from(board(&mut rig, |board| !board.i2c_bus.levels(now).1));
+            let valid_s = until(&mut rig, "a valid current", 0.3, |rig| {
+                rig.view.first_valid_current.is_some()
+            });
+            worst_s = worst_s.max(valid_s);
+            let [errors, recoveries] = counters(&mut rig, 0x0110, 2)[..] else {
+                panic!("two counters");
+            };
+            assert!(
+                errors <= looked_for + 1 && recoveries == errors,
+                "byte {bytes}, bit {bit}: {errors} errors, {recoveries} recoveries"
+            );
+        }
+    }
+    println!(
+        "F11: of 27 resets in the middle of a read {held} left SDA low; valid after {:.0} ms at most",
+        worst_s * 1e3
+    );
+    assert!(held >= 9, "{held}");
 }
 
 #[test]
