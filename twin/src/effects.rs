@@ -794,6 +794,7 @@ mod tests {
             rms: 25.0,
             step_s: 0.5,
             reading_step_s: 0.5,
+            spectral_step_s: 0.5,
             span_s: 150.0,
             capacity_ah: 2.0,
             soc: (0.1, 0.95),

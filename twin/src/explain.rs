@@ -54,8 +54,8 @@ use select::{Named, Selection};
 pub use strays::{RARE, STRAY};
 use strays::{name_by_place, slips};
 use told::{
-    attribute, base_found, behind_ends, current_off, effects, fitted, not_told, plots, sentence,
-    short, times_found,
+    attribute, base_found, behind_ends, current_off, effects, fitted, not_told, overstated, plots,
+    sentence, short, times_found,
 };
 use trust::{vague, vague_beside, wavering};
 use unfitted::{Unfitted, confirmed, not_there, veto};
@@ -303,6 +303,7 @@ fn tell(
         .remarks
         .extend(not_told(bench, &selection, &reported));
     report.remarks.extend(behind_ends(&read));
+    report.remarks.extend(overstated(bench, &selection.plain));
     report
         .remarks
         .extend(others.iter().filter_map(|other| other.beyond(model)));

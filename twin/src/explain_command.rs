@@ -46,6 +46,8 @@ const FILES: [&str; 4] = [
 ];
 /// A hold-out of which more of the changes are found in the fitted recording is a copy of it.
 const COPIED: f64 = 0.9;
+/// So is one with so many of them in a row: a piece of it was fitted. Coarse readings agree by chance now and then, not all along.
+const COPIED_IN_A_ROW: usize = 50;
 /// So many of them are compared.
 const COMPARED: usize = 10_000;
 /// Times of a copy may have been written anew, with another origin and fewer digits: that much they may differ by, in s.
@@ -89,7 +91,7 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     for id in &arguments.without {
         if registry::find(id).is_none() {
-            return Err(Failure::Input(format!(
+            return Err(Failure(format!(
                 "--without {id}: found no such effect, expected one of {}",
                 registry::ids().join(", ")
             )));
@@ -97,7 +99,7 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     }
     let out = &arguments.out;
     if out.exists() && !out.is_dir() {
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{}: found a file, expected a folder or a new name",
             out.display()
         )));
@@ -140,9 +142,10 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
         };
         let other = prepare(&model, &inputs, Purpose::HoldOut)
             .map_err(|failure| without_reference(failure, arguments.reference.is_some()))?;
-        if let Some(signal) = copied(&prepared, &other) {
-            return Err(Failure::Input(format!(
-                "{}, column {signal}: found the readings of {}, expected another recording: a hold-out is never fitted",
+        if let Some((signal, [from_s, to_s])) = copied(&prepared, &other) {
+            return Err(Failure(format!(
+                "{}, column {signal}, from {from_s} to {to_s} s: found the readings of {}, expected another recording or the part of this one \
+                 that is not fitted: a hold-out is never fitted",
                 file.display(),
                 arguments.recording.display()
             )));
@@ -231,7 +234,7 @@ fn lacking(
         .map(String::as_str)
         .collect();
     if lacks.len() == fits.len() {
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{}: found {} to compare, expected the column {}, which is fitted in {}: a hold-out shows what is fitted",
             file.display(),
             has.join(" and "),
@@ -256,18 +259,16 @@ fn thinned(prepared: Prepared) -> Vec<Problem> {
 /// A hold-out that lacks the column of the reference, while the recording has its own in a file beside it.
 fn without_reference(failure: Failure, beside: bool) -> Failure {
     match failure {
-        Failure::Input(text) if beside && text.contains("expected a column") => {
-            Failure::Input(format!(
-                "{text}: --reference belongs to --recording alone, a hold-out has its reference in a column of its own"
-            ))
-        }
+        Failure(text) if beside && text.contains("expected a column") => Failure(format!(
+            "{text}: --reference belongs to --recording alone, a hold-out has its reference in a column of its own"
+        )),
         other => other,
     }
 }
 
-/// The first signal of a hold-out whose readings are those of the fitted recording at the same times, from whatever origin.
-/// Only those that differ from the one before are looked at: at rest two recordings may read the same.
-fn copied(fitted: &Prepared, other: &Prepared) -> Option<String> {
+/// The first signal of a hold-out whose readings, or those of a piece of it, are those of the fitted recording at the same times, from whatever
+/// origin, and from when to when. Only those that differ from the one before are looked at: at rest two recordings may read the same.
+fn copied(fitted: &Prepared, other: &Prepared) -> Option<(String, [f64; 2])> {
     other.items.iter().find_map(|item| {
         let name = &item.problem.name;
         let same = fitted.items.iter().find(|one| one.problem.name == *name)?;
@@ -288,16 +289,30 @@ fn copied(fitted: &Prepared, other: &Prepared) -> Option<String> {
                     .is_some_and(|known_s| *known_s <= t_s + REWRITTEN_S)
             })
         };
-        let is_copy = |origin_s: f64| {
-            let shared = some
+        let piece = |origin_s: f64| {
+            let shared: Vec<bool> = some
                 .iter()
-                .filter(|(t_s, value)| is_there(t_s + origin_s, *value));
-            shared.count() as f64 > COPIED * some.len() as f64
+                .map(|(t_s, value)| is_there(t_s + origin_s, *value))
+                .collect();
+            let count = shared.iter().filter(|shared| **shared).count();
+            let mut runs = shared.chunk_by(|one, next| one == next).scan(0, |at, run| {
+                let from = *at;
+                *at += run.len();
+                Some((run[0], from..*at))
+            });
+            let rows = if count as f64 > COPIED * some.len() as f64 {
+                Some(0..some.len())
+            } else {
+                runs.find_map(|(shared, run)| {
+                    (shared && run.len() >= COPIED_IN_A_ROW).then_some(run)
+                })
+            };
+            rows.map(|rows| [some[rows.start].0, some[rows.end - 1].0])
         };
         origins(&some, &known)
             .into_iter()
-            .any(is_copy)
-            .then(|| name.clone())
+            .find_map(piece)
+            .map(|times_s| (name.clone(), times_s))
     })
 }
 

@@ -1,4 +1,4 @@
-//! The command line of `twin`: exit code 0 done, 1 the check asked for failed, 2 bad input.
+//! The command line of `twin`: exit code 0 done, 2 bad input.
 
 use std::io::{self, IsTerminal as _, Write as _};
 use std::process::ExitCode;
@@ -74,7 +74,7 @@ fn say(summary: &str) -> Result<(), Failure> {
     let mut out = io::stdout();
     match writeln!(out, "{summary}").and_then(|()| out.flush()) {
         // A reader that has seen enough (`| head`) is no failure.
-        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Failure::Input(format!(
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Failure(format!(
             "standard output: found \"{error}\" from the system, expected a place that can be written"
         ))),
         _ => Ok(()),

@@ -255,7 +255,7 @@ impl Model {
         let source = path.display().to_string();
         let bytes = fs::read(path).map_err(|error| recording::Error::reading(path, &error))?;
         let text = String::from_utf8(bytes).map_err(|_| {
-            Failure::Input(format!(
+            Failure(format!(
                 "{source}: found bytes that are not UTF-8, expected TOML"
             ))
         })?;
@@ -650,7 +650,7 @@ fn read_ocv(path: &Path) -> Result<Vec<(f64, f64)>, Failure> {
     let (soc, volts) = (table.need("soc")?, table.need("ocv_v")?);
     let points: Vec<(f64, f64)> = soc.iter().copied().zip(volts.iter().copied()).collect();
     check_ocv(&points, |what, expected| {
-        Failure::Input(format!(
+        Failure(format!(
             "{}: found {what}, expected {expected}",
             path.display()
         ))

@@ -238,7 +238,7 @@ fn nothing_to_compare(model: &Model, frame: &Frame) -> Failure {
             "a current with soc_pct, v_cell_v or v_pack_v"
         });
     }
-    Failure::Input(format!(
+    Failure(format!(
         "{}: found the columns {}, expected {}; other names: --map NAME=COLUMN, or [columns] in {}",
         frame.source(),
         frame.names().join(", "),
@@ -332,7 +332,7 @@ impl<'a> Work<'a> {
             && self.reference.is_none()
             && self.frame.origin(&reference) == column
         {
-            return Err(Failure::Input(format!(
+            return Err(Failure(format!(
                 "{}: found the column {column} as the sensor's reference and as its reading, expected two columns",
                 self.frame.source()
             )));
@@ -635,14 +635,14 @@ impl<'a> Work<'a> {
         }
         for frame in [reference, self.frame] {
             if frame.clocks().len() > 1 {
-                return Err(Failure::Input(format!(
+                return Err(Failure(format!(
                     "{}: found a clock that starts anew with each cycle, expected one clock for the whole file where --reference is given",
                     frame.source()
                 )));
             }
         }
         let Some(value) = value else {
-            return Err(Failure::Input(format!(
+            return Err(Failure(format!(
                 "{}: found no column {measured}, expected it beside --reference: the clocks are compared by it",
                 self.frame.source()
             )));
@@ -650,7 +650,7 @@ impl<'a> Work<'a> {
         let sensed = align::Signal::new(self.frame.t_s(), value, |row| fresh.rows[row]);
         let driven = align::Signal::new(reference.t_s(), found, |_| true);
         let alignment = align::estimate(&driven, &sensed).map_err(|what| {
-            Failure::Input(format!(
+            Failure(format!(
                 "{} and {}: {what}",
                 reference.source(),
                 self.frame.source()

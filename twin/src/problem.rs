@@ -8,6 +8,9 @@ mod smooth;
 use std::ops::{Deref, DerefMut, Range};
 use std::sync::Arc;
 
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
+
 /// A signal that is compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum View {
@@ -178,6 +181,8 @@ pub struct Observed {
     pub moments: Moments,
     /// Time between two new readings, in s, where readings repeat though the design says that each is new; else 0.
     pub held_s: f64,
+    /// Time between two readings before they were thinned out ([`Problem::thinned`]), in s; 0 if all are here.
+    pub thinned_from_s: f64,
     /// Step of the grid on which readings lie and to which the simulation does not round, in the view's unit; 0 if there is none.
     pub grid: f64,
 }
@@ -190,6 +195,7 @@ impl Observed {
             stretches: Stretches::one(value.len()),
             moments: Moments::EveryRow,
             held_s: 0.0,
+            thinned_from_s: 0.0,
             grid: 0.0,
             t_s: t_s.into(),
             value,
@@ -332,10 +338,40 @@ impl Accuracy {
     }
 }
 
-/// At most so many of some rows, evenly.
-pub fn evenly(rows: impl Iterator<Item = usize> + Clone, most: usize) -> Vec<usize> {
+/// At most so many of some rows, one of each stretch of as many: where in it is drawn, the same way each time. With the first of each, what is
+/// faster than two stretches would be taken for something slower.
+pub fn spread_out(rows: impl Iterator<Item = usize> + Clone, most: usize) -> Vec<usize> {
     let stride = rows.clone().count().div_ceil(most.max(1)).max(1);
-    rows.step_by(stride).collect()
+    if stride == 1 {
+        return rows.collect();
+    }
+    let mut random = ChaCha8Rng::seed_from_u64(stride as u64);
+    let mut wanted = 0;
+    let mut chosen = Vec::with_capacity(most);
+    for (at, row) in rows.enumerate() {
+        if at % stride == 0 {
+            wanted = ((u64::from(random.next_u32()) * stride as u64) >> 32) as usize;
+        }
+        if at % stride == wanted {
+            chosen.push(row);
+        }
+    }
+    chosen
+}
+
+/// The median of the steps between times that go on; 0 without any. In s.
+pub fn median_step_s(times_s: impl Iterator<Item = f64> + Clone) -> f64 {
+    let next = times_s.clone().skip(1);
+    let mut steps: Vec<f64> = times_s
+        .zip(next)
+        .map(|(from, to)| to - from)
+        .filter(|step| *step > 0.0)
+        .collect();
+    let middle = steps.len() / 2;
+    if steps.is_empty() {
+        return 0.0;
+    }
+    *steps.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 /// Values between which a quantity goes in a straight line over a step whose mean lies at a share of the way from one of its ends to the
@@ -380,7 +416,7 @@ impl Problem {
         }
     }
 
-    /// The same with at most so many of its readings, evenly thinned out: the simulation still runs over every row of the drive. Means
+    /// The same with at most so many of its readings, thinned out ([`spread_out`]): the simulation still runs over every row of the drive. Means
     /// from one reading to the next stay as they are.
     pub fn thinned(mut self, most: usize) -> Self {
         let observed = &self.observed;
@@ -388,7 +424,12 @@ impl Problem {
             return self;
         }
         let counts = |row: &usize| observed.valid[*row] && observed.value[*row].is_finite();
-        let rows = evenly((0..observed.t_s.len()).filter(counts), most);
+        let rows = spread_out((0..observed.t_s.len()).filter(counts), most);
+        let thinned_from_s = median_step_s(
+            (0..observed.t_s.len())
+                .filter(counts)
+                .map(|row| observed.t_s[row]),
+        );
         let of = |series: &[f64]| rows.iter().map(|&row| series[row]).collect::<Vec<f64>>();
         if let Base::Sensor(base) = &mut self.base
             && !base.reading.is_empty()
@@ -401,6 +442,7 @@ impl Problem {
             valid: vec![true; rows.len()],
             stretches: rows.iter().map(|&row| observed.segment_of(row)).collect(),
             held_s: observed.held_s,
+            thinned_from_s,
             grid: observed.grid,
             moments: match &observed.moments {
                 Moments::EveryRow => Moments::Rows(rows),

@@ -1086,3 +1086,59 @@ fn columns_by_other_names_are_hinted_at() {
         ],
     );
 }
+
+#[test]
+fn a_hold_out_of_which_a_piece_was_fitted() {
+    let whole = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(900, |t| format!("{t},{},{}", current(t), current(t) + 0.5));
+    let files = [("m.toml", PAIR), ("r.csv", &good()), ("whole.csv", &whole)];
+    says(
+        &refused(&files, &explain_with(&["--holdout", "whole.csv"])),
+        &[
+            "whole.csv, column i_meas_a, from 0 to 29.9",
+            "readings of r.csv",
+            "the part of this one that is not fitted",
+        ],
+    );
+    let rest = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(600, |t| {
+            let t = t + 30.0;
+            format!("{t},{},{}", current(t), current(t) + 0.5)
+        });
+    let files = [("m.toml", PAIR), ("r.csv", &good()), ("rest.csv", &rest)];
+    report(&files, &["--holdout", "rest.csv"]);
+}
+
+#[test]
+fn a_state_of_charge_tells_the_currents_sign_and_the_unit_of_time() {
+    let model = "schema = 1\n[battery]\ncapacity_ah = 1\ninitial_soc = 0.9\nnoise_pct = 0.3\n";
+    let charge_c =
+        |t: f64| 10.0 / 0.37 * (1.0 - (0.37 * t).cos()) + 3.0 / 1.91 * (1.0 - (1.91 * t).cos()) + t;
+    let recording = |sign: f64, second: f64| {
+        "t_s,i_ref_a,soc_pct\n".to_owned()
+            + &rows(3000, |t| {
+                format!(
+                    "{},{},{:.1}",
+                    t / second,
+                    sign * current(t),
+                    90.0 - charge_c(t) / 36.0
+                )
+            })
+    };
+    says(
+        &explained(model, &recording(-1.0, 1.0)),
+        &[
+            "soc_pct rises where i_ref_a discharges",
+            "charging positive",
+            "--map i_ref_a=-i_ref_a",
+        ],
+    );
+    for (second, unit) in [(60.0, "in min"), (3600.0, "in h")] {
+        says(
+            &explained(model, &recording(1.0, second)),
+            &["r.csv, column soc_pct", "charge of i_ref_a", unit],
+        );
+    }
+    let files = [("m.toml", model), ("r.csv", &recording(1.0, 1.0))];
+    report(&files, &[]);
+}

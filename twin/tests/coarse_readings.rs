@@ -4,11 +4,7 @@
 
 mod common;
 
-use std::fs;
-
-use common::{noise, said};
-use twin::model::Model;
-use twin::prepare::{Inputs, Purpose, prepare};
+use common::{noise, prepared, said};
 use twin::report::data::{Report, Verdict};
 
 /// Seconds of drive, and of rest after it.
@@ -41,22 +37,13 @@ fn read_in_steps(column: &str, step: f64, capacity_ah: f64, seed: u64) -> Report
         let read = ((value + noise()) / step).round() * step;
         text.push_str(&format!("{second},{current_a},{read:.4}\n"));
     }
-    let folder = tempfile::tempdir().unwrap();
-    let recording = folder.path().join("r.csv");
-    fs::write(&recording, text).unwrap();
     // What is stated is what rounding has in the mean, as if each reading were rounded for itself.
     let stated = step / 12f64.sqrt();
     let model = format!(
         "schema = 1\n[battery]\ncapacity_ah = {BY_DESIGN_AH}\ninitial_soc = {INITIAL_SOC}\n\
          ocv = [[0, 3.2], [1, 4.1]]\nnoise_pct = {stated}\nnoise_v = {stated}\n"
     );
-    let model = Model::parse("m.toml", model, folder.path()).unwrap();
-    let inputs = Inputs {
-        recording,
-        reference: None,
-        mapping: Vec::new(),
-    };
-    let mut prepared = prepare(&model, &inputs, Purpose::Compare).unwrap();
+    let mut prepared = prepared(&text, &model);
     assert!(
         prepared
             .remarks

@@ -53,7 +53,7 @@ fn the_documentation_names_every_key() {
         "x = 1",
     ];
     for text in unknown {
-        let Err(Failure::Input(sentence)) = parse(&format!("schema = 1\n{text}\n")) else {
+        let Err(Failure(sentence)) = parse(&format!("schema = 1\n{text}\n")) else {
             panic!("{text}");
         };
         let keys: Vec<&str> = sentence
@@ -285,7 +285,7 @@ fn faults_name_line_key_and_what_was_expected() {
     // A name of one's own is a name if the file goes by it.
     parse("schema = 1\n[columns]\nh_a = \"H\"\n[sensor]\nreference = \"h_a\"\n").unwrap();
     for (text, expected) in cases {
-        let Err(Failure::Input(sentence)) = parse(text) else {
+        let Err(Failure(sentence)) = parse(text) else {
             panic!("taken: {text}");
         };
         assert!(sentence.starts_with("m.toml"), "{sentence}");

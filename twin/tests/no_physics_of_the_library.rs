@@ -5,11 +5,7 @@
 
 mod common;
 
-use std::fs;
-
-use common::{noise, said, sensor};
-use twin::model::Model;
-use twin::prepare::{Inputs, Purpose, prepare};
+use common::{noise, prepared, said, sensor};
 use twin::report::data::{Report, Verdict};
 
 /// What is said of a state of charge in steps of half a per cent that is corrected once, at 1200 s of 2000 s, by so many points. The
@@ -32,19 +28,10 @@ fn corrected_once(points: f64, seed: u64) -> Report {
             (2.0 * soc_pct).round() / 2.0
         ));
     }
-    let folder = tempfile::tempdir().unwrap();
-    let recording = folder.path().join("r.csv");
-    fs::write(&recording, text).unwrap();
     let model = format!(
         "schema = 1\n[battery]\ncapacity_ah = {capacity_ah}\ninitial_soc = {initial_soc}\n"
     );
-    let model = Model::parse("m.toml", model, folder.path()).unwrap();
-    let inputs = Inputs {
-        recording,
-        reference: None,
-        mapping: Vec::new(),
-    };
-    let mut prepared = prepare(&model, &inputs, Purpose::Compare).unwrap();
+    let mut prepared = prepared(&text, &model);
     said(prepared.items.remove(0).problem, seed, &[])
 }
 

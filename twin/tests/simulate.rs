@@ -65,6 +65,7 @@ fn observed(t_s: impl Into<Series>) -> Observed {
     let rows = t_s.len();
     Observed {
         held_s: 0.0,
+        thinned_from_s: 0.0,
         grid: 0.0,
         t_s,
         value: vec![f64::NAN; rows],

@@ -33,7 +33,7 @@ impl Effect for Hum {
             // Less than one turn without an interruption is no line: any slow course has a part of one.
             0 => (
                 1.0 / scale.span_s.max(1e-9),
-                0.5 / scale.reading_step_s.max(1e-9),
+                0.5 / scale.spectral_step_s.max(1e-9),
             ),
             1 => (0.0, scale.full_scale),
             _ => (-10.0, 10.0),
@@ -49,7 +49,7 @@ impl Effect for Hum {
             .collect();
         let (lowest_hz, _) = self.bounds(0, scale);
         let late_s = clues.t_s.first().map_or(0.0, |first| first - scale.begin_s);
-        spectrum::lines(clues.t_s, &residual, scale.reading_step_s)
+        spectrum::lines(clues.t_s, &residual, scale.spectral_step_s)
             .into_iter()
             .filter(|line| line.frequency_hz >= lowest_hz)
             .map(|line| {
@@ -86,6 +86,7 @@ mod tests {
         let scale = Scale {
             full_scale: 600.0,
             reading_step_s: 0.1,
+            spectral_step_s: 0.1,
             span_s: 300.0,
             ..Scale::default()
         };

@@ -180,7 +180,7 @@ fn updates(clues: &Clues<'_>, scale: &Scale) -> Vec<(f64, f64)> {
         .zip(&simulated)
         .map(|(seen, simulated)| seen - share * simulated)
         .collect();
-    spectrum::strongest(clues.t_s, &beyond, scale.reading_step_s, UPDATES)
+    spectrum::strongest(clues.t_s, &beyond, scale.spectral_step_s, UPDATES)
         .into_iter()
         .filter(|frequency_hz| *frequency_hz > 0.0)
         .map(|frequency_hz| {

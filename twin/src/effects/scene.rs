@@ -44,7 +44,10 @@ pub struct Scale {
     pub step_s: f64,
     /// Median step of the readings that count, in s.
     pub reading_step_s: f64,
-    /// The same as a whole part of the time covered, in s: where steps are even, it keeps in step over the recording.
+    /// Step of the grid that spectra of readings are laid out on, in s: that of all readings, before they were thinned out, where that is not too
+    /// long.
+    pub spectral_step_s: f64,
+    /// Of [`Scale::reading_step_s`]: the same as a whole part of the time covered, in s: where steps are even, it keeps in step over the recording.
     pub even_s: f64,
     /// Time of the first observed row in s.
     pub begin_s: f64,

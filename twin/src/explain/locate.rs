@@ -401,7 +401,7 @@ fn band(bench: &Workbench<'_>, residual: &[f64], random: &mut ChaCha8Rng) -> Opt
 
 /// Energy of a series in bands of frequency: from and to, in Hz, and the energy in the view's unit squared.
 fn bands(bench: &Workbench<'_>, series: &[f64]) -> Vec<(f64, f64, f64)> {
-    spectrum::density(&bench.t_s, series, bench.scale.reading_step_s, 16)
+    spectrum::density(&bench.t_s, series, bench.scale.spectral_step_s, 16)
         .into_iter()
         .map(|(from, to, density)| (from, to, density * density * (to - from)))
         .collect()

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 pub use grow::added;
 pub use losses::{beaten, worse};
-pub use obstacle::{CERTAIN, at_end};
+pub use obstacle::{CERTAIN, at_end, stands_at_top};
 pub use rivals::{does_as_well, joins};
 
 use super::fit::{Fit, fit, in_the_mean, other_minimum, polish};

@@ -3,10 +3,10 @@
 use super::fit::Fit;
 use super::flexible::Explainable;
 use super::intervals::Reported;
-use super::select::{Selection, percent};
+use super::select::{Selection, percent, stands_at_top};
 use super::slope::{BASE_OFF, at_base_end};
 use super::workbench::{Member, Workbench};
-use super::{Nuisance, locate};
+use super::{Nuisance, locate, rms};
 use crate::effects::ocv::bend_v;
 use crate::effects::{CurrentError, find};
 use crate::problem::{Base, Problem};
@@ -176,7 +176,42 @@ pub(super) fn not_told(
             short(bench.scale.step_s)
         )
     });
-    unmoved.chain(by_edges).collect()
+    let at_top = members.iter().flat_map(|member| {
+        let parameters = member.effect.card().parameters.iter().enumerate();
+        parameters
+            .filter(|(p, _)| stands_at_top(bench, member, *p))
+            .map(|(p, parameter)| {
+                format!(
+                    "{name}: {} of {} stands at the end of what is searched, {} {}: it is that or more, and the intervals of this effect hold for that value alone",
+                    parameter.name,
+                    member.id(),
+                    short(member.values[p]),
+                    unit(bench.problem, parameter.unit)
+                )
+            })
+    });
+    unmoved.chain(by_edges).chain(at_top).collect()
+}
+
+/// A stated noise must be within what the readings are off by in all, whatever else is behind that. Below this share of it, it is not.
+const OVERSTATED: f64 = 0.5;
+
+/// What is to be said of a stated noise that the readings cannot have. The part of it with a memory may have stood still.
+pub(super) fn overstated(bench: &Workbench<'_>, plain: &Fit) -> Option<String> {
+    const FEWEST: usize = 50;
+    let problem = bench.problem;
+    let white = problem.noise.powi(2) - problem.coloured.rms.powi(2);
+    let all = rms(plain.residual.iter().copied());
+    (bench.len() >= FEWEST && bench.censored.is_none() && all * all < OVERSTATED.powi(2) * white).then(|| {
+        format!(
+            "{}: the model file states a noise of {} {unit}, and recording and simulation differ by {} {unit} in all: a noise that is stated too \
+             large (in another unit?) hides what is missing",
+            problem.name,
+            short(problem.noise),
+            short(all),
+            unit = problem.unit
+        )
+    })
 }
 
 /// What an effect does, in words of the signal's unit: the library is written for currents.

@@ -314,6 +314,7 @@ mod tests {
             rms: 100.0,
             step_s: 0.1,
             reading_step_s: 0.1,
+            spectral_step_s: 0.1,
             span_s: 1000.0,
             capacity_ah: 50.0,
             ..Scale::default()

@@ -395,6 +395,20 @@ pub(super) fn doubt(
     doubts.extend(not_there.map(|(_, text)| text));
     doubts.extend(placed.map(str::to_owned));
     doubts.extend(quietening(bench, &selection.fit));
+    // A memory longer than any that is looked for: the sizes that belong to it are not told either.
+    doubts.extend(members.iter().flat_map(|member| {
+        let times = member.effect.card().parameters.iter().enumerate();
+        times
+            .filter(|(p, time)| time.unit == "s" && select::stands_at_top(bench, member, *p))
+            .map(|(p, time)| {
+                format!(
+                    "{} of {} stands at the end of what is searched, {} s",
+                    time.name,
+                    member.id(),
+                    short(member.values[p])
+                )
+            })
+    }));
     if doubts.is_empty() {
         // What is left moves the values, however sure the names are: if it is more than noise is stated to.
         let most = signs

@@ -20,7 +20,9 @@ use crate::effects::chain::{Begun, Chain, Change, Nuisance, Variation};
 use crate::effects::ocv::bend_v;
 use crate::effects::scene::{ROUNDS, Scale, charge_range};
 use crate::effects::{Clues, Effect, LIBRARY, Mark, Parameter, Says, Stage, find_with};
-use crate::problem::{Base, Coloured, Drive, Moments, Problem, Series, View, evenly};
+use crate::problem::{
+    Base, Coloured, Drive, Moments, Problem, Series, View, median_step_s, spread_out,
+};
 
 /// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row). [`Problem::thinned`]
 /// does so ahead, for less memory; here it is done for what it leaves as it is.
@@ -236,7 +238,12 @@ impl<'a> Workbench<'a> {
         let valid = (0..observed.t_s.len()).filter(|&row| {
             observed.valid[row] && observed.value[row].is_finite() && all[row].is_finite()
         });
-        let rows = evenly(valid, MOST_ROWS);
+        let rows = spread_out(valid.clone(), MOST_ROWS);
+        let every_s = if observed.thinned_from_s > 0.0 {
+            observed.thinned_from_s
+        } else {
+            median_step_s(valid.map(|row| observed.t_s[row]))
+        };
         let at = |series: &[f64]| rows.iter().map(|&row| series[row]).collect::<Vec<f64>>();
         let (t_s, y, designed) = (at(&observed.t_s), at(&observed.value), at(&all));
         let (censored, contradiction) = match Censored::of(problem, &y) {
@@ -269,7 +276,12 @@ impl<'a> Workbench<'a> {
             (Some(censored), Some(ahead)) => Some(censored.as_compared(ahead.clone())),
             _ => None,
         };
-        let scale = scale(problem, &t_s, &y, plain.as_ref().unwrap_or(&designed));
+        let scale = scale(
+            problem,
+            (&t_s, every_s),
+            &y,
+            plain.as_ref().unwrap_or(&designed),
+        );
         let found = match &problem.base {
             Base::Sensor(_) => Steady::of(problem, &scale, &rows, [&y, &designed]),
             // No voltage is looked at over what a reference's noise makes of a current.
@@ -827,23 +839,28 @@ fn rms(values: impl Iterator<Item = f64>) -> f64 {
     }
 }
 
-fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
+/// Cells of the longest grid of a spectrum of readings that were thinned out.
+const MOST_CELLS: f64 = (1 << 20) as f64;
+
+/// `t_s`: times of the readings that are looked at, and the step between all of them.
+fn scale(problem: &Problem, (t_s, every_s): (&[f64], f64), y: &[f64], plain: &[f64]) -> Scale {
     let drive = &problem.drive;
     let largest = drive
         .reference
         .iter()
         .fold(0.0f64, |most, x| most.max(x.abs()));
     let step_s = drive.median_step_s();
-    let mut steps: Vec<f64> = t_s
-        .windows(2)
-        .map(|pair| pair[1] - pair[0])
-        .filter(|step| *step > 0.0)
-        .collect();
-    let middle = steps.len() / 2;
-    let reading_step_s = if steps.is_empty() {
-        step_s
+    let or_row = |reading_s: f64| if reading_s > 0.0 { reading_s } else { step_s };
+    let reading_step_s = or_row(median_step_s(t_s.iter().copied()));
+    let covered_s = match t_s {
+        [first, .., last] => last - first,
+        _ => 0.0,
+    };
+    // Of readings that were thinned out lines are told up to half the rate at which they came, as far as that can be laid out.
+    let spectral_step_s = if every_s > 0.0 && covered_s <= MOST_CELLS * every_s {
+        every_s.min(reading_step_s)
     } else {
-        *steps.select_nth_unstable_by(middle, f64::total_cmp).1
+        reading_step_s
     };
     let longest_s = |stretches: &[Range<usize>]| {
         stretches
@@ -860,6 +877,7 @@ fn scale(problem: &Problem, t_s: &[f64], y: &[f64], plain: &[f64]) -> Scale {
         mismatch: rms(y.iter().zip(plain).map(|(y, p)| y - p)),
         step_s,
         reading_step_s,
+        spectral_step_s,
         even_s: match t_s {
             [first, .., last] if reading_step_s > 0.0 && last > first => {
                 (last - first) / ((last - first) / reading_step_s).round().max(1.0)

@@ -113,7 +113,7 @@ impl Extension<'_> {
     }
 
     fn wrong(&self, what: &str) -> Failure {
-        Failure::Input(format!(
+        Failure(format!(
             "{}: {what}, expected tables [effects.<id>]",
             self.source
         ))

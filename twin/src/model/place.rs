@@ -57,7 +57,7 @@ impl<'a> Places<'a> {
             );
         }
         let Some(span) = error.span() else {
-            return Failure::Input(format!("{}: {message}", self.source));
+            return Failure(format!("{}: {message}", self.source));
         };
         let line = self.line(span.start);
         let text = self.text.lines().nth(line - 1).unwrap_or_default();
@@ -67,7 +67,7 @@ impl<'a> Places<'a> {
         } else {
             String::new()
         };
-        Failure::Input(format!("{}, line {line}{key}: {message}", self.source))
+        Failure(format!("{}, line {line}{key}: {message}", self.source))
     }
 
     /// A fault at a key, or at the nearest table above it that is there.
@@ -79,7 +79,7 @@ impl<'a> Places<'a> {
         if !path.is_empty() {
             place.push_str(&format!(", key {}", path.join(".")));
         }
-        Failure::Input(format!("{place}: found {found}, expected {expected}"))
+        Failure(format!("{place}: found {found}, expected {expected}"))
     }
 
     fn find(&self, path: &[&str]) -> Option<usize> {

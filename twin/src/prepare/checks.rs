@@ -43,7 +43,7 @@ pub(super) fn some_values(values: &[f64], name: &str, source: &str) -> Result<()
     if values.iter().any(|value| value.is_finite()) {
         return Ok(());
     }
-    Err(Failure::Input(format!(
+    Err(Failure(format!(
         "{source}, column {name}: found no value, expected numbers"
     )))
 }
@@ -57,7 +57,7 @@ pub(super) fn not_constant(values: &[f64], name: &str, source: &str) -> Result<(
     if known.any(|value| value != first) {
         return Ok(());
     }
-    Err(Failure::Input(format!(
+    Err(Failure(format!(
         "{source}, column {name}: found {} in every row, expected a signal that moves",
         number(*first)
     )))
@@ -68,7 +68,7 @@ pub(super) fn time_goes_on(frame: &Frame) -> Result<(), Failure> {
     let t_s = frame.t_s();
     let moves = t_s.windows(2).any(|pair| pair[0] != pair[1]);
     match t_s.first() {
-        Some(first) if !moves && t_s.len() > 1 => Err(Failure::Input(format!(
+        Some(first) if !moves && t_s.len() > 1 => Err(Failure(format!(
             "{}, column {}: found {} in every row, expected a time in s that goes on",
             frame.source(),
             frame.origin("t_s"),
@@ -101,7 +101,7 @@ pub(super) fn surroundings(frame: &Frame) -> Result<Vec<String>, Failure> {
             .filter(|value| (lowest..=highest).contains(*value))
             .count();
         if possible == 0 {
-            return Err(Failure::Input(format!(
+            return Err(Failure(format!(
                 "{}, column {}: found {} … {}, expected {unit}, {lowest} … {highest} (it may be in {instead})",
                 frame.source(),
                 frame.origin(name),
@@ -133,7 +133,7 @@ pub(super) fn milliseconds(frame: &Frame) -> Result<Option<String>, Failure> {
     let t_s = frame.t_s();
     let (source, column) = (frame.source(), frame.origin("t_s"));
     if let Some(late) = t_s.iter().find(|t| t.abs() > NO_TIME_S) {
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{source}, column {column}: found a time of {}, expected s (since 1970 it may be in ms, µs or ns)",
             number(*late)
         )));
@@ -163,7 +163,7 @@ pub(super) fn moments(model: &Model, problem: &Problem) -> Result<(), Failure> {
         if value.abs() <= span_s {
             return Ok(());
         }
-        Err(Failure::Input(format!(
+        Err(Failure(format!(
             "{}, key {key}: found {}, expected less than the recording's {}",
             model.source,
             number(value),
@@ -206,14 +206,14 @@ pub(super) fn enough(problem: &Problem, source: &str) -> Result<(), Failure> {
             let [low, high] = range(t_s.iter().copied()).unwrap_or_default();
             format!("{} … {} s", number(shown(low)), number(shown(high)))
         };
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{source}, column {}: found readings at {} and a reference at {}, expected both at the same time",
             problem.name,
             span(&problem.observed.t_s),
             span(&drive.t_s)
         )));
     }
-    Err(Failure::Input(format!(
+    Err(Failure(format!(
         "{source}, column {}: found {rows} readings to compare, expected at least {FEWEST_ROWS}",
         problem.name
     )))
@@ -425,7 +425,7 @@ pub(super) fn pair(
             (measured, reference)
         };
         let factor = 1000_f64.powi(power.abs());
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{source}: {large} moves by {:.4} and {small} by {:.4}, a factor near {factor}: found two units, expected the same \
              unit in both (one of them may be in thousandths)",
             spread_x.max(spread_y),
@@ -433,13 +433,13 @@ pub(super) fn pair(
         )));
     }
     if (SURELY_OPPOSITE..OPPOSITE).contains(&together) {
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{source}: {measured} falls where {reference} rises, but only loosely (correlation {together:.2}): found two signals \
              that are hardly of the same run, expected a sensor and its reference"
         )));
     }
     if together < OPPOSITE {
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{source}: {measured} falls where {reference} rises (correlation {together:.2}): found opposite signs, expected \
              discharge positive in both; to turn one: --map {}",
             frame.turned(measured)
@@ -453,15 +453,9 @@ const HOUR_S: f64 = 3600.0;
 /// A ratio is that of C and Ah if it is within this factor of one.
 const HOUR_WITHIN: f64 = 1.25;
 
-/// Unit and sign of a charge counter, against the charge of the reference.
-pub(super) fn counter(
-    drive: &Drive,
-    readings: &Observed,
-    interval_s: f64,
-    frame: &Frame,
-    column: &str,
-) -> Result<(), Failure> {
-    let source = frame.source();
+/// By how much the reference's charge in C, and the readings, move from one time to the next: over times of at least an interval, some
+/// two for each of the [`FEWEST_ROWS`].
+fn moved(drive: &Drive, readings: &Observed, interval_s: f64) -> Vec<(f64, f64)> {
     let charge_c = integral(&drive.t_s, &drive.segments, &drive.reference, false);
     let charge = Drive {
         reference: charge_c.into(),
@@ -490,6 +484,19 @@ pub(super) fn counter(
             last = Some(row);
         }
     }
+    moved
+}
+
+/// Unit and sign of a charge counter, against the charge of the reference.
+pub(super) fn counter(
+    drive: &Drive,
+    readings: &Observed,
+    interval_s: f64,
+    frame: &Frame,
+    column: &str,
+) -> Result<(), Failure> {
+    let source = frame.source();
+    let moved = moved(drive, readings, interval_s);
     if moved.len() < FEWEST_ROWS / 2 {
         return Ok(());
     }
@@ -518,13 +525,13 @@ pub(super) fn counter(
         })
     };
     if let Some(unit) = unit {
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{source}, column {column}: found a charge that moves by {of_counter:.4} where the reference's moves by \
              {of_reference:.4} C, expected C in both (it may be in {unit}, or the time not in s)"
         )));
     }
     if together < 0.0 {
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{source}: {column} falls where the reference's charge rises (correlation {together:.2}): found opposite signs, \
              expected discharge positive in both; to turn one: --map {}",
             frame.turned(column)
@@ -707,6 +714,60 @@ fn moves(values: impl Iterator<Item = f64> + Clone) -> bool {
     steps < COURSE * variance
 }
 
+/// Stretches over which a state of charge is compared with the charge that flowed.
+const SOC_STRETCHES: usize = 20;
+
+/// Sign and time of a battery with a state of charge, against the charge of the current.
+fn state_of_charge(
+    drive: &Drive,
+    observed: &Observed,
+    base: &BatteryBase,
+    [frame, of_current]: [&Frame; 2],
+    [name, current]: [&str; 2],
+) -> Result<(), Failure> {
+    let source = frame.source();
+    // A per cent less is so much that was discharged.
+    let per_cent_c = base.capacity_ah * HOUR_S / 100.0;
+    // It has steps and noise of its own: few stretches, over which it moves by more than those.
+    let span_s = match (observed.t_s.first(), observed.t_s.last()) {
+        (Some(first), Some(last)) => last - first,
+        _ => 0.0,
+    };
+    let moved: Vec<(f64, f64)> = moved(drive, observed, span_s / SOC_STRETCHES as f64)
+        .into_iter()
+        .map(|(charge_c, per_cent)| (charge_c, -per_cent * per_cent_c))
+        .collect();
+    let together = correlation(moved.iter().copied());
+    if moved.len() < SOC_STRETCHES / 2 || together.abs() < -SURELY_OPPOSITE {
+        return Ok(());
+    }
+    let of_current_c = spread(moved.iter().map(|(charge_c, _)| *charge_c));
+    let of_soc_c = spread(moved.iter().map(|(_, charge_c)| *charge_c));
+    let ratio = of_soc_c / of_current_c;
+    let near = |factor: f64| (ratio / factor).ln().abs() <= HOUR_WITHIN.ln();
+    let unit = match thousands(ratio) {
+        _ if near(60.0) => Some("the time may be in min"),
+        _ if near(HOUR_S) => Some("the time may be in h"),
+        Some(power) if power > 0 => Some("the current may be in kA"),
+        Some(_) => Some("the current may be in mA, or the time in ms"),
+        None => None,
+    };
+    if let Some(unit) = unit {
+        return Err(Failure(format!(
+            "{source}, column {name}: found a state of charge that moves by {of_soc_c:.4} C of capacity_ah where the charge of {current} moves \
+             by {of_current_c:.4} C, expected about as much ({unit})"
+        )));
+    }
+    if together < 0.0 {
+        return Err(Failure(format!(
+            "{source}: {name} rises where {current} discharges (correlation {together:.2}): found charging positive, expected discharge \
+             positive; to turn it: --map {}",
+            of_current.turned(current)
+        )));
+    }
+    Ok(())
+}
+
 /// Units and signs of a battery.
 pub(super) fn battery(
     view: View,
@@ -724,12 +785,12 @@ pub(super) fn battery(
     if view == View::StateOfCharge {
         let most = pairs.fold(0.0_f64, |most, (_, soc)| most.max(soc.abs()));
         if most <= 1.01 {
-            return Err(Failure::Input(format!(
+            return Err(Failure(format!(
                 "{source}, column {name}: found values up to {}, expected per cent, 0 to 100",
                 number(most)
             )));
         }
-        return Ok(());
+        return state_of_charge(drive, observed, base, [frame, of_current], [name, current]);
     }
     let mut volts: Vec<f64> = pairs.clone().map(|(_, volts)| volts).collect();
     let mut table: Vec<f64> = base.ocv.iter().map(|(_, volts)| *volts).collect();
@@ -737,7 +798,7 @@ pub(super) fn battery(
         return Ok(());
     };
     if let Some(power) = thousands(middle / designed) {
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{source}, column {name}: found voltages around {middle:.4}, 10^{} times the open-circuit voltage {designed:.4} V, expected V",
             3 * power
         )));
@@ -755,7 +816,7 @@ pub(super) fn battery(
         } else {
             format!("; a pack's voltage is {PACK}, with cells in [battery]")
         };
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{source}, column {name}: found voltages around {middle:.4} V, expected some within reach of the open-circuit \
              voltage, {low:.4} … {high:.4} V{hint}"
         )));
@@ -766,7 +827,7 @@ pub(super) fn battery(
         amperes.select_nth_unstable_by((0.98 * last as f64) as usize, f64::total_cmp);
     let drop = *most * base.resistance_ohm;
     if drop > high {
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{source}, column {current}: found currents up to {most:.4}, which over ohmic_resistance_ohm are {drop:.4} V, more than \
              the open-circuit voltage, {high:.4} V; expected A, and Ω (one of the two may be in thousandths)"
         )));
@@ -778,7 +839,7 @@ pub(super) fn battery(
         .map(|(from, to)| (to.0 - from.0, to.1 - from.1));
     let together = correlation(steps);
     if together > -OPPOSITE {
-        return Err(Failure::Input(format!(
+        return Err(Failure(format!(
             "{source}: {name} rises where {current} rises (correlation {together:.2}): found charging positive, expected discharge \
              positive; to turn it: --map {}",
             of_current.turned(current)

@@ -212,7 +212,7 @@ fn hinted(error: Error) -> Failure {
     } else {
         ""
     };
-    Failure::Input(format!("{error}{hint}"))
+    Failure(format!("{error}{hint}"))
 }
 
 /// The column that reads the same current or power as this one.

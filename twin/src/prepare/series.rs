@@ -136,6 +136,7 @@ pub(super) fn drive_rows(
         stretches: stretches(drive),
         moments: Moments::EveryRow,
         held_s: 0.0,
+        thinned_from_s: 0.0,
         grid: 0.0,
     };
     (observed, Arc::clone(rows))
@@ -150,6 +151,7 @@ pub(super) fn every_row(drive: &Drive) -> Observed {
         stretches: stretches(drive),
         moments: Moments::EveryRow,
         held_s: 0.0,
+        thinned_from_s: 0.0,
         grid: 0.0,
     }
 }

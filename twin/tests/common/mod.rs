@@ -1,8 +1,12 @@
 //! What tests with recordings of their own share.
 
+use std::fs;
+
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 use twin::explain::{Options, explain};
+use twin::model::Model;
+use twin::prepare::{Inputs, Prepared, Purpose, prepare};
 use twin::problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, View};
 use twin::report::data::Report;
 
@@ -39,6 +43,21 @@ pub fn sensor(t_s: Vec<f64>, current_a: Vec<f64>, reading_a: Vec<f64>, noise_a: 
         coloured: Coloured::default(),
         accuracy: Accuracy::default(),
     }
+}
+
+/// A recording and its model file, both as text, prepared to be explained as `twin explain` does.
+#[allow(dead_code, reason = "not every test has files")]
+pub fn prepared(recording: &str, model: &str) -> Prepared {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let path = folder.path().join("r.csv");
+    fs::write(&path, recording).expect("the recording is written");
+    let model = Model::parse("m.toml", model.to_owned(), folder.path()).expect("a model file");
+    let inputs = Inputs {
+        recording: path,
+        reference: None,
+        mapping: Vec::new(),
+    };
+    prepare(&model, &inputs, Purpose::Compare).expect("a recording that can be prepared")
 }
 
 /// What is said of a problem, with effects taken out of the library.

@@ -180,6 +180,17 @@ fn size_beside(bench: &Workbench<'_>, residual: &[f64], model: &Model, index: us
     (all, share(size, seen))
 }
 
+/// Whether a value that may stand at the upper end of its search does. What lies beyond is not looked at: the recording tells only that it is
+/// that or more.
+pub fn stands_at_top(bench: &Workbench<'_>, member: &Member, p: usize) -> bool {
+    let parameter = &member.effect.card().parameters[p];
+    let (_, high) = member.effect.bounds(p, &bench.scale);
+    parameter.search == Search::Logarithmic
+        && (parameter.open || parameter.to_top)
+        && !parameter.internal
+        && member.values[p] >= 0.99 * high
+}
+
 /// What of an effect's values would be at the end of what is physics.
 pub fn at_end(bench: &Workbench<'_>, member: &Member) -> Option<String> {
     let card = member.effect.card();
