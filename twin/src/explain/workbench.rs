@@ -24,7 +24,7 @@ use crate::problem::{
     Base, Coloured, Drive, Moments, Problem, Series, View, median_step_s, spread_out,
 };
 
-/// Rows that fits look at; longer recordings are thinned out evenly (the simulation still runs over every row). [`Problem::thinned`]
+/// Rows that fits look at; of longer recordings one is drawn from each of as many stretches (the simulation still runs over every row). [`Problem::thinned`]
 /// does so ahead, for less memory; here it is done for what it leaves as it is.
 pub const MOST_ROWS: usize = 250_000;
 /// Blocks that are held out in turn.
