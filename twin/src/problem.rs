@@ -349,7 +349,8 @@ pub fn spread_out(rows: impl Iterator<Item = usize> + Clone, most: usize) -> Vec
     let mut wanted = 0;
     let mut chosen = Vec::with_capacity(most);
     for (at, row) in rows.enumerate() {
-        if at % stride == 0 {
+        // The first stays: times count from it.
+        if at % stride == 0 && at > 0 {
             wanted = ((u64::from(random.next_u32()) * stride as u64) >> 32) as usize;
         }
         if at % stride == wanted {
