@@ -106,7 +106,7 @@ fn open_sensor_is_found_within_two_readings_and_no_legal_level_is_taken_for_one(
         readings.len()
     );
 
-    // Between two codes of ADC1, 0.36 A each: the meter counts what the network does not show, for longer than both windows.
+    // Between two codes of ADC1, 0.45 A each (3.3 V / 4,096 at 1.8 mV/A): the meter counts what the network does not show, for longer than both windows.
     bench.vehicle(at_rest().with_current(0.2));
     bench.run(25.0);
     let complaints = bench.complaints(&["SocUncertain", "ChargeRestoredWithLoss"]);

@@ -6,7 +6,7 @@ mod common;
 
 use std::f64::consts::TAU;
 
-use common::{noise, said, sensor};
+use common::{noise, said, sensor, steps};
 use twin::report::data::Verdict;
 
 /// With every third reading the line would lie at 0.033 Hz.
@@ -14,17 +14,8 @@ use twin::report::data::Verdict;
 fn a_line_keeps_its_frequency_when_readings_are_thinned_out() {
     const LINE_HZ: f64 = 3.3;
     for seed in 1..4 {
-        let mut load_a = noise(seed, 60.0);
         let mut reads_a = noise(seed + 100, 0.35);
-        let mut current_a = 0.0;
-        let (t_s, currents): (Vec<f64>, Vec<f64>) = (0..12_000)
-            .map(|row| {
-                if row % 50 == 0 {
-                    current_a = load_a();
-                }
-                (0.1 * f64::from(row), current_a)
-            })
-            .unzip();
+        let (t_s, currents) = steps(seed, 60.0, 12_000, 50);
         let readings = t_s
             .iter()
             .zip(&currents)

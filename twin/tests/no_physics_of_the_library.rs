@@ -5,7 +5,7 @@
 
 mod common;
 
-use common::{noise, prepared, said, sensor};
+use common::{noise, prepared, said, sensor, steps};
 use twin::report::data::{Report, Verdict};
 
 /// What is said of a state of charge in steps of half a per cent that is corrected once, at 1200 s of 2000 s, by so many points. The
@@ -46,17 +46,8 @@ fn a_state_of_charge_that_is_corrected_once_is_no_capacity() {
 #[test]
 fn a_dead_sensor_is_clipped_by_nothing() {
     for (seed, stated_a) in [(1, 0.15), (2, 0.0), (3, 0.15), (4, 0.0)] {
-        let mut load_a = noise(seed, 60.0);
         let mut reads_a = noise(seed + 100, 0.15);
-        let mut current_a = 0.0;
-        let (t_s, currents): (Vec<f64>, Vec<f64>) = (0..2000)
-            .map(|row| {
-                if row % 10 == 0 {
-                    current_a = load_a();
-                }
-                (0.1 * f64::from(row), current_a)
-            })
-            .unzip();
+        let (t_s, currents) = steps(seed, 60.0, 2000, 10);
         let readings = currents.iter().map(|_| 0.05 + reads_a()).collect();
         let report = said(sensor(t_s, currents, readings, stated_a), seed, &[]);
         assert_eq!(report.verdict, Verdict::Unknown, "{seed}: {report:?}");

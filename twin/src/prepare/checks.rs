@@ -714,6 +714,14 @@ fn moves(values: impl Iterator<Item = f64> + Clone) -> bool {
     steps < COURSE * variance
 }
 
+/// What is to be said of a current that is turned, and of what shows it.
+fn charging_positive(shown: String, (frame, current): (&Frame, &str)) -> Failure {
+    Failure(format!(
+        "{shown}: found charging positive, expected discharge positive; to turn it: --map {}",
+        frame.turned(current)
+    ))
+}
+
 /// Stretches over which a state of charge is compared with the charge that flowed.
 const SOC_STRETCHES: usize = 20;
 
@@ -759,11 +767,12 @@ fn state_of_charge(
         )));
     }
     if together < 0.0 {
-        return Err(Failure(format!(
-            "{source}: {name} rises where {current} discharges (correlation {together:.2}): found charging positive, expected discharge \
-             positive; to turn it: --map {}",
-            of_current.turned(current)
-        )));
+        return Err(charging_positive(
+            format!(
+                "{source}: {name} rises where {current} discharges (correlation {together:.2})"
+            ),
+            (of_current, current),
+        ));
     }
     Ok(())
 }
@@ -839,11 +848,10 @@ pub(super) fn battery(
         .map(|(from, to)| (to.0 - from.0, to.1 - from.1));
     let together = correlation(steps);
     if together > -OPPOSITE {
-        return Err(Failure(format!(
-            "{source}: {name} rises where {current} rises (correlation {together:.2}): found charging positive, expected discharge \
-             positive; to turn it: --map {}",
-            of_current.turned(current)
-        )));
+        return Err(charging_positive(
+            format!("{source}: {name} rises where {current} rises (correlation {together:.2})"),
+            (of_current, current),
+        ));
     }
     Ok(())
 }

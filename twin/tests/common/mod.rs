@@ -22,6 +22,21 @@ pub fn noise(seed: u64, deviation: f64) -> impl FnMut() -> f64 {
     }
 }
 
+/// A load in A that is drawn anew every so many rows of 0.1 s, and their times in s.
+#[allow(dead_code, reason = "not every test has a drive of steps")]
+pub fn steps(seed: u64, deviation_a: f64, rows: u32, every: u32) -> (Vec<f64>, Vec<f64>) {
+    let mut load_a = noise(seed, deviation_a);
+    let mut current_a = 0.0;
+    (0..rows)
+        .map(|row| {
+            if row % every == 0 {
+                current_a = load_a();
+            }
+            (0.1 * f64::from(row), current_a)
+        })
+        .unzip()
+}
+
 /// Readings of a sensor beside its current in A, at the same instants in s, under a design that states the noise alone.
 #[allow(dead_code, reason = "not every test has a sensor")]
 pub fn sensor(t_s: Vec<f64>, current_a: Vec<f64>, reading_a: Vec<f64>, noise_a: f64) -> Problem {
