@@ -651,6 +651,7 @@ mod tests {
         let t_s = series(&|k| 0.5 * k);
         let drive = Drive {
             mean_share: None,
+            holds: None,
             t_s: t_s.clone(),
             reference: series(&|k| {
                 30.0 * (0.05 * k).sin() + if k % 70.0 < 30.0 { 20.0 } else { 0.0 }

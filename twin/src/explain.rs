@@ -201,13 +201,13 @@ fn one(
         left_out = Some(reach_s);
     }
     let Answer {
-        smooth,
+        other,
         decided,
         shown,
         between,
     } = answer;
     let part = tell(
-        smooth.as_ref().unwrap_or(&course),
+        other.as_ref().unwrap_or(&course),
         (decided, &shown),
         between,
         options,
@@ -357,6 +357,15 @@ struct Decided {
 impl Decided {
     fn names_nothing(&self) -> bool {
         self.selection.named.is_empty()
+    }
+
+    /// Ids of what is named, sorted.
+    fn names(&self) -> Vec<&'static str> {
+        let members = &self.selection.fit.model.members;
+        let named = self.selection.named.iter();
+        let mut ids: Vec<_> = named.map(|named| members[named.index].id()).collect();
+        ids.sort_unstable();
+        ids
     }
 
     /// The bench that it was decided on.

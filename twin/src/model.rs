@@ -21,6 +21,7 @@ use place::Places;
 use crate::{
     effects::{self, Parameter, scene::ZERO_CELSIUS_K},
     failure::Failure,
+    problem::Holds,
 };
 
 /// Version of the format.
@@ -146,6 +147,8 @@ pub struct Battery {
     pub cells: u32,
     /// Column of the current; `i_ref_a`, else `i_meas_a` if not stated.
     pub current: Option<String>,
+    /// How it goes from row to row, if not in straight lines; `twin explain` finds it.
+    pub current_holds: Option<Holds>,
     /// What that column reads without a current, in A.
     pub current_zero_a: f64,
     /// Its standard uncertainty.
@@ -187,6 +190,7 @@ struct BatteryText {
     #[serde(default = "one_cell")]
     cells: u32,
     current: Option<String>,
+    current_holds: Option<Holds>,
     #[serde(default)]
     current_zero_a: f64,
     #[serde(default)]
@@ -633,6 +637,7 @@ fn resolve(text: BatteryText, places: &Places<'_>, folder: &Path) -> Result<Batt
         initial_soc_uncertainty: text.initial_soc_uncertainty,
         cells: text.cells,
         current: text.current,
+        current_holds: text.current_holds,
         current_zero_a: text.current_zero_a,
         current_zero_uncertainty_a: text.current_zero_uncertainty_a,
         noise_v: text.noise_v,

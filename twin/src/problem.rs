@@ -3,11 +3,13 @@
 //! Recording and model file become one [`Problem`] for each signal that can be compared. Everything after that
 //! (location, effects, selection) knows nothing of files.
 
+mod holds;
 mod smooth;
 
 use std::ops::{Deref, DerefMut, Range};
 use std::sync::Arc;
 
+pub use holds::Holds;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
 
@@ -93,6 +95,8 @@ pub struct Drive {
     /// Where the mean over the step that ends at each row lies, from the value where it begins (0) to the one where it ends (1), as a
     /// counter beside the current tells ([`ends`]); `None`: half-way, the reference goes in straight lines.
     pub mean_share: Option<Series>,
+    /// The reference stays at one value between its rows, and [`Self::mean_share`] says so.
+    pub holds: Option<Holds>,
     /// Stretches with one clock and no gap; filters start anew in each.
     pub segments: Vec<Range<usize>>,
     /// True where the segment of the same index continues the one before: a gap, and no new operation. What a cell or a core

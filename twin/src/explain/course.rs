@@ -1,4 +1,4 @@
-//! A reference between its rows: in straight lines, or smoothly.
+//! A reference between its rows: in straight lines, smoothly, or, the current of a battery, at one value.
 
 use std::borrow::Cow;
 
@@ -7,13 +7,14 @@ use super::unfitted::Unfitted;
 use super::workbench::{Member, Model, Workbench};
 use super::{Decided, Holdout, Options, decide, gained, lead_in, rms};
 use crate::effects::Search;
-use crate::problem::Problem;
+use crate::problem::{Holds, Problem};
+use crate::report::data::Verdict;
 
-/// The reference goes smoothly from row to row if that makes the loss smaller by this (odds of e¹⁰, for no value more); where its
+/// The reference goes smoothly from row to row, or stays, if that makes the loss smaller by this (odds of e¹⁰, for no value more); where its
 /// rows alone tell so, unless it makes it larger by this.
 const CLEARLY: f64 = 10.0;
 
-/// A signal with the files that were never fitted, as the reference goes from row to row: in straight lines, or smoothly.
+/// A signal with the files that were never fitted, as the reference goes from row to row.
 pub(super) struct Course<'a> {
     pub(super) problem: Cow<'a, Problem>,
     pub(super) holdouts: Cow<'a, [Holdout]>,
@@ -21,29 +22,29 @@ pub(super) struct Course<'a> {
 
 /// What is decided about a signal, on the course of the reference that it is decided on.
 pub(super) struct Answer {
-    /// The smooth course, if it is that.
-    pub(super) smooth: Option<Course<'static>>,
+    /// The course, if it is not in straight lines.
+    pub(super) other: Option<Course<'static>>,
     pub(super) decided: Decided,
     /// What the answer leaves of the readings as they were read.
     pub(super) shown: Fit,
-    /// The error with straight lines and with a smooth course, if that was taken.
+    /// The error with straight lines and with that course.
     pub(super) between: Option<[f64; 2]>,
 }
 
 impl Answer {
     fn straight((decided, shown): (Decided, Fit)) -> Self {
         Self {
-            smooth: None,
+            other: None,
             decided,
             shown,
             between: None,
         }
     }
 
-    fn smooth(smooth: Course<'static>, (decided, shown): (Decided, Fit), straight: &Fit) -> Self {
+    fn on(other: Course<'static>, (decided, shown): (Decided, Fit), straight: &Fit) -> Self {
         let errors = [straight, &shown].map(|fit| rms(fit.residual.iter().copied()));
         Self {
-            smooth: Some(smooth),
+            other: Some(other),
             decided,
             shown,
             between: Some(errors),
@@ -55,7 +56,7 @@ impl Answer {
         if !self.decided.asks_between() {
             return None;
         }
-        let course = self.smooth.as_ref().unwrap_or(straight);
+        let course = self.other.as_ref().unwrap_or(straight);
         let bench = Workbench::new(&course.problem, &options.without);
         if self.decided.names_nothing() {
             // Such readings may be why.
@@ -132,7 +133,7 @@ impl Course<'_> {
         progress: &mut dyn FnMut(f64, &str),
     ) -> Answer {
         let Some((smooth, told)) = self.smooth() else {
-            return Answer::straight(self.decided(options, progress));
+            return self.answered_of_battery(options, progress);
         };
         let enough = if told { -CLEARLY } else { CLEARLY };
         // Where the smooth one is clearly nearer to begin with, the straight one would lead to names of what it lacks.
@@ -146,7 +147,7 @@ impl Course<'_> {
             let otherwise = self.left_by(&decided.selection.fit.model);
             let names = !decided.names_nothing() && decided.asks_between();
             if names && gained(&otherwise, &shown) > enough {
-                return Answer::smooth(smooth, (decided, shown), &otherwise);
+                return Answer::on(smooth, (decided, shown), &otherwise);
             }
             ahead = Some((decided, shown));
         }
@@ -154,8 +155,47 @@ impl Course<'_> {
         if decided.asks_between() && smooth.may_fit(&decided, &shown, enough) {
             let (again, there) = ahead.unwrap_or_else(|| smooth.decided(options, progress));
             if gained(&shown, &there) > enough {
-                return Answer::smooth(smooth, (again, there), &shown);
+                return Answer::on(smooth, (again, there), &shown);
             }
+        }
+        Answer::straight((decided, shown))
+    }
+
+    /// The same of a battery, whose current may stay at one value between its rows, where that makes a charge that no counter tells.
+    fn answered_of_battery(
+        &self,
+        options: &Options,
+        progress: &mut dyn FnMut(f64, &str),
+    ) -> Answer {
+        let (mut decided, shown) = self.decided(options, progress);
+        if decided.verdict == Verdict::NoMismatch || !self.problem.may_hold() {
+            return Answer::straight((decided, shown));
+        }
+        let model = decided.selection.fit.model.clone();
+        let nearest = Holds::ALL
+            .map(|holds| {
+                let form = |problem: &Problem| problem.with_holding(holds);
+                let course = self.with(form(&self.problem), form);
+                let gained = gained(&shown, &course.left_by(&model));
+                (holds, course, gained)
+            })
+            .into_iter()
+            .max_by(|one, other| one.2.total_cmp(&other.2));
+        let Some((holds, course, nearer)) = nearest else {
+            return Answer::straight((decided, shown));
+        };
+        if !decided.names_nothing() && nearer <= -CLEARLY {
+            return Answer::straight((decided, shown));
+        }
+        let (again, there) = course.decided(options, progress);
+        let better = gained(&shown, &there);
+        if better > CLEARLY {
+            return Answer::on(course, (again, there), &shown);
+        }
+        // As good either way, and what is named turns on it.
+        if better > -CLEARLY && !decided.names_nothing() && again.names() != decided.names() {
+            decided.verdict = Verdict::Ambiguous;
+            decided.but = Some(holds.but_if());
         }
         Answer::straight((decided, shown))
     }

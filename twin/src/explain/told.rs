@@ -470,7 +470,7 @@ pub(super) fn behind_ends(bench: &Workbench<'_>) -> Option<String> {
 }
 
 /// What the times of the readings, and the reference between its rows, were found to be beside the effects. `course`: the error with
-/// straight lines and with a smooth course, if that was taken.
+/// straight lines and with the course that was taken, if it is another.
 pub(super) fn times_found(
     bench: &Workbench<'_>,
     fit: &Fit,
@@ -491,14 +491,18 @@ pub(super) fn times_found(
             if later_s > 0.0 { "before" } else { "after" },
         ),
     });
-    let smooth = course.map(|[straight, smooth]| {
+    let course = course.map(|[straight, other]| {
+        let goes = match bench.problem.drive.holds {
+            None => "between its rows the reference is taken to go smoothly".to_owned(),
+            Some(holds) => format!("each row's current {}", holds.in_words()),
+        };
         format!(
-            "{name}: between its rows the reference is taken to go smoothly (error {} {unit}, with straight lines {} {unit})",
-            short(smooth),
+            "{name}: {goes} (error {} {unit}, with straight lines {} {unit})",
+            short(other),
             short(straight)
         )
     });
-    aligned.into_iter().chain(smooth).collect()
+    aligned.into_iter().chain(course).collect()
 }
 
 /// What error of a battery's recorded current would look the same as a named effect, and whether that is likelier than the effect.
@@ -589,6 +593,7 @@ pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
         nuisance: fit.model.nuisance.clone(),
         of_battery: matches!(problem.base, Base::Battery(_)),
         smooth_reference: matches!(&problem.base, Base::Sensor(base) if base.smooth_reference),
+        current_holds: problem.drive.holds,
     }
 }
 

@@ -11,6 +11,7 @@ use super::{BEYOND_SOC, Battery};
 use crate::{
     effects::{chain::Nuisance, ocv::bent, scene::USUAL_B_K},
     failure::Failure,
+    problem::Holds,
 };
 
 /// An effect to be written into a model file.
@@ -43,6 +44,8 @@ pub struct Shift {
     pub voltage_alignment_s: f64,
     /// The reference goes from row to row in a smooth course.
     pub smooth_reference: bool,
+    /// A battery's current stays at one value between its rows.
+    pub current_holds: Option<Holds>,
 }
 
 impl Shift {
@@ -161,6 +164,9 @@ impl Extension<'_> {
         };
         if self.shift.voltage_alignment_s != 0.0 {
             add(table, "alignment_s", self.shift.voltage_alignment_s);
+        }
+        if let Some(holds) = self.shift.current_holds {
+            set(table, "current_holds", value(holds.as_str()));
         }
         // Where none is stated, each recording's first reading tells its own: one of this recording would be wrong for any other.
         if let Some(soc) = battery.initial_soc.filter(|_| self.shift.soc != 0.0) {

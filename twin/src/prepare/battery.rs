@@ -82,6 +82,9 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
                 .to_owned(),
         );
     }
+    if let Some(holds) = battery.current_holds {
+        drive.hold(holds);
+    }
     let counter_ah = work.drive_frame().column(COUNTER);
     let counter_ah: Option<Vec<f64>> =
         counter_ah.map(|ah| parts.rows.iter().map(|row| ah[*row]).collect());
@@ -89,6 +92,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
     if let Some(told) = told.and_then(|ah| counter::between_rows(&drive, ah)) {
         work.remark(told.remark);
         drive.mean_share = Some(told.mean_share);
+        drive.holds = None;
     }
     let mut items = Vec::new();
     for (view, name) in views {

@@ -205,6 +205,7 @@ fn finer(drive: &Drive, slopes: Slopes) -> Drive {
     let also = |series: &Option<Series>| series.as_ref().map(|series| straight(series));
     Drive {
         mean_share: None,
+        holds: None,
         t_s,
         reference,
         sensor_temperature_c: also(&drive.sensor_temperature_c),

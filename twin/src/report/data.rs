@@ -71,6 +71,8 @@ pub struct FittedModel {
     pub of_battery: bool,
     /// Whether the reference was found to go from row to row in a smooth course.
     pub smooth_reference: bool,
+    /// Whether a battery's current was found to stay at one value from row to row, and which.
+    pub current_holds: Option<crate::problem::Holds>,
 }
 
 /// The files that the report is about.
