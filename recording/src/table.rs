@@ -272,6 +272,15 @@ impl Table {
         }
     }
 
+    /// Puts other values in the place of a column's, one for each row. Another number of them, or a column that is not there, changes
+    /// nothing.
+    pub fn replace(&mut self, name: &str, values: Vec<f64>) {
+        let column = self.columns.iter_mut().find(|column| column.name == name);
+        if let Some(column) = column.filter(|column| column.values.len() == values.len()) {
+            column.values = values;
+        }
+    }
+
     /// With its time checked.
     pub fn into_recording(self) -> Result<Recording> {
         Recording::from_table(self)

@@ -14,6 +14,7 @@ mod phase;
 mod series;
 mod slips;
 mod stairs;
+mod stamps;
 mod start;
 
 use std::{path::PathBuf, sync::Arc};

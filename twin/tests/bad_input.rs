@@ -1005,7 +1005,7 @@ type Course<'a> = &'a dyn Fn(f64) -> f64;
 
 #[test]
 fn a_reference_that_stands_is_not_at_fault() {
-    // The car stands for half a minute; a dead sensor reads its noise; the sensor comes to rest slowly.
+    // The car stands for half a minute; a dead sensor reads its noise; the sensor comes to rest slowly, or settles behind a step.
     let noise = |t: f64| ((12.9898 * t).sin() * 43_758.547).fract();
     let stands = |at: f64| {
         move |t: f64| {
@@ -1017,7 +1017,12 @@ fn a_reference_that_stands_is_not_at_fault() {
         }
     };
     let slowly = |t: f64| current(t.min(10.0)) * (1.0 - 0.03 * (t - 10.0).max(0.0)).max(0.0);
-    let cases: [(Course<'_>, Course<'_>); 3] = [
+    let behind_a_lag = |t: f64| {
+        let settling = 2.1 + 14.0 * (-(t - 10.0) / 8.0).exp();
+        0.3 * noise(t) + if t < 10.0 { current(t) } else { settling }
+    };
+    let cases: [(Course<'_>, Course<'_>); 4] = [
+        (&stands(2.0), &behind_a_lag),
         (&stands(0.0), &noise),
         (&stands(2.0), &noise),
         (&stands(0.0), &slowly),

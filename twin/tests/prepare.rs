@@ -929,6 +929,83 @@ fn stairs(reference: Course<'_>, sensor: Course<'_>) -> Vec<String> {
     remarks.into_iter().filter(about).collect()
 }
 
+/// What is made of rows each 0.1 s, from a time on, with these stamps.
+fn stamped(begin_s: f64, stamp: impl Fn(f64) -> f64) -> (Vec<f64>, Vec<String>) {
+    let rows = (0..1000).map(|k| {
+        let t_s = begin_s + 0.1 * f64::from(k);
+        vec![stamp(t_s), current(t_s), current(t_s) + 0.5]
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    (problem.observed.t_s.to_vec(), remarks)
+}
+
+#[test]
+fn rows_of_one_time_stamp_are_spread_until_the_next() {
+    // Whole seconds, from anywhere within one; days since 1970 in one case, in which a double keeps 0.2 us.
+    for begin_s in [0.0, 0.35, 7.95, 1.7e9 + 0.35] {
+        let (t_s, remarks) = stamped(begin_s, f64::floor);
+        let [remark] = remarks.as_slice() else {
+            panic!("{remarks:?}");
+        };
+        assert!(
+            remark.contains("mostly 10 rows say the same one, 1 s apart"),
+            "{remark}"
+        );
+        // A row is within its tenth of a second: the second says no more.
+        for (k, t_s) in t_s.iter().enumerate() {
+            let off_s = t_s - (begin_s + 0.1 * k as f64);
+            assert!((-0.1..=1e-6).contains(&off_s), "row {k}: {off_s} s");
+        }
+    }
+    // Eleven and twelve rows by turns are a rate of its own, too.
+    let (t_s, remarks) = stamped(0.0, |t| (t / 1.15).floor() * 1.15);
+    assert_eq!(remarks.len(), 1, "{remarks:?}");
+    assert!(
+        t_s.windows(2)
+            .all(|pair| (0.09..0.11).contains(&(pair[1] - pair[0])))
+    );
+}
+
+#[test]
+fn a_time_that_comes_twice_now_and_then_stays() {
+    let (t_s, remarks) = stamped(0.0, |t| {
+        let row = (10.0 * t).round();
+        0.1 * (row - f64::from(row % 7.0 == 3.0))
+    });
+    assert!(remarks.is_empty(), "{remarks:?}");
+    assert_eq!(
+        t_s.windows(2).filter(|pair| pair[0] == pair[1]).count(),
+        143
+    );
+    // Rows that were written twice.
+    let rows = (0..1000).map(|k| {
+        let t_s = 0.1 * f64::from(k / 2);
+        vec![t_s, current(t_s), current(t_s)]
+    });
+    let (problem, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    let spread = |remark: &String| remark.contains("spread evenly");
+    assert!(!remarks.iter().any(spread), "{remarks:?}");
+    assert!(
+        problem
+            .drive
+            .t_s
+            .iter()
+            .all(|t| (10.0 * t).fract().abs() < 1e-6 || (10.0 * t).fract() > 1.0 - 1e-6)
+    );
+    // Two series that were joined by time: one moment, two rows.
+    let rows = (0..1000).map(|k| {
+        let t_s = 0.1 * f64::from(k / 2);
+        let (reference, measured) = if k % 2 == 0 {
+            (current(t_s), f64::NAN)
+        } else {
+            (f64::NAN, current(t_s))
+        };
+        vec![t_s, reference, measured]
+    });
+    let (_, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+    assert!(!remarks.iter().any(spread), "{remarks:?}");
+}
+
 /// A value for each row.
 type Course<'a> = &'a dyn Fn(i32) -> f64;
 

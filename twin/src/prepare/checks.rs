@@ -35,6 +35,9 @@ const WILD_ROWS: usize = 3;
 const WILD_MOST: f64 = 0.02;
 /// Steps' mean square, over the variance, below which values have a course: 2 is noise.
 const COURSE: f64 = 0.5;
+/// Parts of a standstill, each in the mean, between which a reading that settles goes one way: noise may turn it by this factor.
+const SETTLING_PARTS: usize = 8;
+const ONE_WAY: f64 = 1.25;
 /// A share of the readings at an end of their range that is worth a remark.
 const CLIPPED_SHARE: f64 = 0.005;
 
@@ -690,10 +693,15 @@ fn stuck(drive: &Drive, observed: &Observed, reference: &str, measured: &str) ->
                 .map(|row| observed.value[row]);
             // At 0 the car may stand.
             let stands = drive.reference[start] == 0.0 || inside.clone().count() < 20;
-            if !stands && spread(inside.clone()) > 0.3 * wide && moves(inside) {
+            let stands_at = drive.reference[start];
+            if !stands
+                && spread(inside.clone()) > 0.3 * wide
+                && moves(inside.clone())
+                && !settles(inside, stands_at)
+            {
                 return Some(format!(
                     "{reference} stands at {} for {} from {} s on while {measured} moves: the reference may be at fault",
-                    number(drive.reference[start]),
+                    number(stands_at),
                     seconds(drive.t_s[end - 1] - drive.t_s[start]),
                     drive.t_s[start]
                 ));
@@ -702,6 +710,21 @@ fn stuck(drive: &Drive, observed: &Observed, reference: &str, measured: &str) ->
         }
     }
     None
+}
+
+/// Whether values go one way towards a value, as a slow sensor does after a step.
+fn settles(values: impl Iterator<Item = f64>, towards: f64) -> bool {
+    let off: Vec<f64> = values.map(|value| value - towards).collect();
+    let part = off.len().div_ceil(SETTLING_PARTS).max(1);
+    let means: Vec<f64> = off
+        .chunks(part)
+        .map(|part| part.iter().sum::<f64>() / part.len() as f64)
+        .collect();
+    let way: f64 = means.windows(2).map(|pair| (pair[1] - pair[0]).abs()).sum();
+    let [Some(first), Some(last)] = [means.first(), means.last()] else {
+        return false;
+    };
+    last.abs() < first.abs() && way <= ONE_WAY * (first - last).abs()
 }
 
 /// Whether values move by more than noise does: of what has no course, the steps' mean square is twice the variance.

@@ -7,7 +7,7 @@ use recording::{
     error::{Kind, number},
 };
 
-use super::{Inputs, PAIRS, SURROUNDINGS, codes};
+use super::{Inputs, PAIRS, SURROUNDINGS, codes, stamps};
 use crate::{failure::Failure, model::Model};
 
 /// No reading is as large, whatever its unit: 1000 A in billionths. What is larger is memory that nothing was written to.
@@ -19,7 +19,7 @@ pub struct Frame {
     recording: Recording,
     /// Names and the columns that they were given to.
     named: Vec<(String, String)>,
-    /// What was taken for missing.
+    /// What was taken for missing, or spread.
     remarks: Vec<String>,
 }
 
@@ -76,7 +76,7 @@ impl Frame {
         self.recording.need(name).map_err(hinted)
     }
 
-    /// What its reader has to know: which values were taken for missing ones.
+    /// What its reader has to know: which values were taken for missing ones, and which times for coarser than the rows.
     pub fn remarks(&self) -> &[String] {
         &self.remarks
     }
@@ -237,7 +237,9 @@ fn mapped(table: Table, wanted: &[(String, String)], model: &Model) -> Result<Fr
         mapping.add(name, column)?;
     }
     let mut table = table.mapped(&mapping)?;
-    let remarks = codes::leave_out(&mut table, &used(model), |name| partner(model, name));
+    let used = used(model);
+    let mut remarks = codes::leave_out(&mut table, &used, |name| partner(model, name));
+    remarks.extend(stamps::spread(&mut table, &used));
     Ok(Frame {
         recording: table.into_recording().map_err(hinted)?,
         named: wanted.to_vec(),

@@ -1,0 +1,98 @@
+//! Time stamps that are coarser than the rows: several rows in a row say the same time.
+
+use recording::{Table, error::number, name::T_S};
+
+use super::series::median;
+use crate::report::format::{at_most, count};
+
+/// Fewer whole runs than this tell of no rate.
+const FEWEST_RUNS: usize = 10;
+/// Runs that have as many rows as is usual, or one more or less, are this share of all at least: a logger with a rate of its own.
+const REGULAR: f64 = 0.8;
+/// A used column has a value in this share of the rows at least: columns that were joined by time share few rows, and there a time that comes twice is
+/// that of two messages.
+const COMPLETE: f64 = 0.6;
+/// Runs within which a used column moves are this share of all at least: else rows were written twice.
+const MOVING: f64 = 0.5;
+/// A time until the next run that is this many times the usual one tells nothing of the rows before it.
+const USUAL: f64 = 1.5;
+
+/// Spreads rows of one time stamp evenly until the next one, where stamps come in runs of much the same length; what was done, in words.
+///
+/// The first run ends where the next one begins: a recording begins anywhere between two stamps.
+pub(super) fn spread(table: &mut Table, names: &[&str]) -> Option<String> {
+    let times_s = table.column(T_S)?;
+    let runs: Vec<&[f64]> = times_s.chunk_by(|one, next| one == next).collect();
+    // The first and the last may be cut.
+    let inner = runs.get(1..runs.len().checked_sub(1)?)?;
+    // A time that is missing or goes back is an error, and its own.
+    if inner.len() < FEWEST_RUNS || !times_s.is_sorted() {
+        return None;
+    }
+    let mut lengths: Vec<f64> = inner.iter().map(|run| run.len() as f64).collect();
+    let usual = median(&mut lengths)?;
+    let regular = lengths
+        .iter()
+        .filter(|length| (**length - usual).abs() <= 1.0);
+    if usual < 2.0 || (regular.count() as f64) < REGULAR * inner.len() as f64 {
+        return None;
+    }
+    let mut apart: Vec<f64> = runs
+        .windows(2)
+        .map(|pair| pair[1][0] - pair[0][0])
+        .collect();
+    let usual_s = median(&mut apart)?;
+    let used = names.iter().filter_map(|name| table.column(name));
+    let used: Vec<&[f64]> = used.filter(|values| is_complete(values)).collect();
+    let mut row = 0;
+    let mut moving = 0;
+    let mut spread = Vec::with_capacity(times_s.len());
+    for (index, run) in runs.iter().enumerate() {
+        let rows = row..row + run.len();
+        row = rows.end;
+        moving += usize::from(used.iter().any(|values| moves(&values[rows.clone()])));
+        let until_s = runs
+            .get(index + 1)
+            .map(|next| next[0] - run[0])
+            .filter(|step| *step <= USUAL * usual_s)
+            .unwrap_or(usual_s);
+        let missing = (usual - run.len() as f64).max(0.0);
+        let is_first = index == 0;
+        let is_last = index + 1 == runs.len();
+        let all = if is_first || is_last {
+            run.len() as f64 + missing
+        } else {
+            run.len() as f64
+        };
+        let ahead = if is_first { missing } else { 0.0 };
+        let begin_s = run[0];
+        spread.extend((0..run.len()).map(|place| begin_s + (ahead + place as f64) / all * until_s));
+    }
+    if (moving as f64) < MOVING * runs.len() as f64 {
+        return None;
+    }
+    let remark = format!(
+        "the times of {} are coarser than its rows: mostly {} say the same one, {} s apart; the rows are spread evenly between them, so \
+         that a time below {} s is not known for certain; expected a time for each row",
+        table.source(),
+        count(usual as usize, "row"),
+        at_most(usual_s, 4),
+        number(usual_s)
+    );
+    table.replace(T_S, spread);
+    Some(remark)
+}
+
+/// Whether a column has values in most rows.
+fn is_complete(values: &[f64]) -> bool {
+    let known = values.iter().filter(|value| value.is_finite()).count();
+    known as f64 >= COMPLETE * values.len() as f64
+}
+
+/// Whether values differ.
+fn moves(values: &[f64]) -> bool {
+    let mut known = values.iter().filter(|value| value.is_finite());
+    known
+        .next()
+        .is_some_and(|first| known.any(|value| value != first))
+}
