@@ -30,6 +30,8 @@ pub mod pins {
     pub const RS485_DRIVER: Pin = Pin::new('A', 1);
     /// Chip select of the ADE7753.
     pub const METER_SELECT: Pin = Pin::new('A', 4);
+    /// MISO of the ADE7753.
+    pub const METER_MISO: Pin = Pin::new('A', 6);
     /// I²C clock.
     pub const I2C_CLOCK: Pin = Pin::new('B', 8);
     /// I²C data.
@@ -44,6 +46,9 @@ pub mod pins {
     pub const HIGH_VOLTAGE: Pin = Pin::new('C', 7);
     /// High-voltage permit.
     pub const PERMIT: Pin = Pin::new('C', 8);
+
+    /// Driven from 5 V.
+    pub const FROM_5_V: [Pin; 3] = [RANGE_FLAG, RANGE_GATE, METER_MISO];
 }
 
 /// ADC1 channel of the sensors' supply, behind a divider by two.

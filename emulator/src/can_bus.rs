@@ -7,7 +7,7 @@
 //! Two virtual nodes stand for all others. One sends (what is given to [`CanBus::inject`], and the flood); like every
 //! node it counts its errors, and comes back from bus-off by itself. The other only listens and acknowledges.
 //!
-//! Not modelled: delays of wires and transceivers, tolerances of the clocks, the pins' alternate functions.
+//! Not modelled: delays of wires and transceivers, tolerances of the clocks.
 
 pub mod bits;
 pub mod node;
@@ -432,6 +432,16 @@ impl CanBus {
             rec: node.rec(),
             state: node.error_state(),
         }
+    }
+
+    /// Whether the board's controller hears by its RX pin (RM0090, 32.4: in loop back mode it does not).
+    pub const fn uses_rx(&self) -> bool {
+        self.stations[BOARD].node.is_on() && !self.board.loops_back()
+    }
+
+    /// Whether it sends by its TX pin.
+    pub const fn uses_tx(&self) -> bool {
+        self.stations[BOARD].node.is_on() && !self.board.is_silent()
     }
 
     fn is_on_bus(&self, index: usize) -> bool {

@@ -179,6 +179,14 @@ impl Adc1 {
         self.parameters.noise_codes = noise_codes;
     }
 
+    /// The input that is connected to the converter now.
+    pub const fn sampled_channel(&self) -> Option<u8> {
+        match self.phase {
+            Phase::Sampling { channel, .. } => Some(channel),
+            _ => None,
+        }
+    }
+
     const fn is_on(&self) -> bool {
         self.cr2 & CR2_ADON != 0
     }

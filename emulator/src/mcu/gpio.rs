@@ -11,9 +11,30 @@ pub const PORT_STRIDE: u32 = 0x400;
 /// Input data register.
 const IDR: u32 = 0x10;
 
-const MODE_OUTPUT: u8 = 0b01;
-const MODE_ALTERNATE: u8 = 0b10;
-const MODE_ANALOG: u8 = 0b11;
+/// What MODER makes of a pin.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// Input.
+    Input = 0b00,
+    /// General-purpose output.
+    Output = 0b01,
+    /// A peripheral's.
+    Alternate = 0b10,
+    /// Off for all digital use.
+    Analog = 0b11,
+}
+
+impl Mode {
+    /// In words.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Input => "input",
+            Self::Output => "output",
+            Self::Alternate => "alternate function",
+            Self::Analog => "analogue",
+        }
+    }
+}
 
 /// One port.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,7 +77,7 @@ impl Port {
     }
 
     fn outputs(&self) -> u16 {
-        Self::pins_with(self.moder, MODE_OUTPUT)
+        Self::pins_with(self.moder, Mode::Output as u8)
     }
 
     /// The pins that are driven from inside, high and low.
@@ -79,7 +100,7 @@ impl Port {
         let undriven = !driven & !high & !low;
         // A low wins: over a pull-up, and over the high of a conflict, whose real level nobody knows.
         let pins = (high | driven & level | undriven & pulled_up) & !low & !(driven & !level);
-        pins & !Self::pins_with(self.moder, MODE_ANALOG)
+        pins & !Self::pins_with(self.moder, Mode::Analog as u8)
     }
 
     fn write(&mut self, offset: u32, bytes: u8, value: u32) -> Result<(), Unmodelled> {
@@ -171,28 +192,42 @@ impl GpioPorts {
         }
     }
 
+    /// The two bits of a pin in a register of such fields.
+    const fn field(register: u32, pin: Pin) -> u32 {
+        register >> (2 * pin.number) & 3
+    }
+
+    /// The mode of a pin.
+    pub const fn mode(&self, pin: Pin) -> Mode {
+        match Self::field(self.ports[pin.port as usize].moder, pin) {
+            0b00 => Mode::Input,
+            0b01 => Mode::Output,
+            0b10 => Mode::Alternate,
+            _ => Mode::Analog,
+        }
+    }
+
     /// The alternate function of a pin, 0 … 15; `None` if it is not in alternate mode.
     pub fn alternate(&self, pin: Pin) -> Option<u8> {
-        let port = self.ports.get(usize::from(pin.port))?;
-        if port.moder >> (2 * pin.number) & 3 != u32::from(MODE_ALTERNATE) {
-            return None;
-        }
-        let field = port.afr[usize::from(pin.number / 8)] >> (4 * (pin.number % 8)) & 0xF;
-        u8::try_from(field).ok()
+        let afr = self.ports[usize::from(pin.port)].afr[usize::from(pin.number / 8)];
+        (self.mode(pin) == Mode::Alternate).then_some((afr >> (4 * (pin.number % 8)) & 0xF) as u8)
+    }
+
+    /// Whether an output of a pin, general-purpose or a peripheral's, only pulls low.
+    pub const fn is_open_drain(&self, pin: Pin) -> bool {
+        self.ports[pin.port as usize].otyper & pin.bit() != 0
+    }
+
+    /// Whether a pin's pull-up or pull-down is on.
+    pub const fn is_pulled(&self, pin: Pin) -> bool {
+        Self::field(self.ports[pin.port as usize].pupdr, pin) != 0
     }
 
     /// The fastest clock that an output of this speed follows (STM32F405 data sheet, I/O AC characteristics, 2.7 … 3.6 V
     /// and 50, 50, 40 and 30 pF; *assumed* until it has been compared with the newest revision).
     pub fn fastest_hz(&self, pin: Pin) -> u64 {
         let ospeedr = self.ports[usize::from(pin.port)].ospeedr;
-        [4_000_000, 25_000_000, 50_000_000, 100_000_000][(ospeedr >> (2 * pin.number) & 3) as usize]
-    }
-
-    /// Whether a pin is in analogue mode, as an ADC input has to be.
-    pub fn is_analog(&self, pin: Pin) -> bool {
-        self.ports
-            .get(usize::from(pin.port))
-            .is_some_and(|port| port.moder >> (2 * pin.number) & 3 == u32::from(MODE_ANALOG))
+        [4_000_000, 25_000_000, 50_000_000, 100_000_000][Self::field(ospeedr, pin) as usize]
     }
 
     /// The levels that IDR and EXTI see; notes where inside and outside drive against each other.
@@ -379,7 +414,10 @@ mod tests {
         // PC4 pull-up, PC6 pull-down, PC0 analogue.
         world.write(&mut gpio, C + PUPDR, 0b01 << 8 | 0b10 << 12);
         world.write(&mut gpio, C + MODER, 0b11);
-        assert!(gpio.is_analog(pins[2]) && !gpio.is_analog(pins[0]));
+        assert_eq!(
+            pins.map(|pin| gpio.mode(pin)),
+            [Mode::Input, Mode::Input, Mode::Analog]
+        );
         assert_eq!(world.read(&mut gpio, C + IDR), 1 << 4);
         for pin in pins {
             world.pins.levels.set(pin, Some(true));
@@ -503,7 +541,7 @@ mod tests {
                 let pin = Pin { port: 2, number };
                 let bit = |word: u16| word & pin.bit() != 0;
                 match gpio.outputs().driven(pin) {
-                    _ if gpio.is_analog(pin) => prop_assert!(!bit(seen)),
+                    _ if gpio.mode(pin) == Mode::Analog => prop_assert!(!bit(seen)),
                     None => prop_assert_eq!(bit(seen), bit(level)),
                     Some(own) => {
                         prop_assert_eq!(bit(seen), own && bit(level));

@@ -269,6 +269,11 @@ impl I2c {
         self.lines = (scl, sda);
     }
 
+    /// Whether it drives the lines, or is about to.
+    pub const fn uses_pins(&self) -> bool {
+        self.phase_has_bus() || self.cr1 & START != 0
+    }
+
     const fn phase_has_bus(&self) -> bool {
         !matches!(self.phase, Phase::Idle { .. })
     }

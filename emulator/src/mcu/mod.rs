@@ -12,6 +12,7 @@ pub mod gpio;
 mod halfword;
 pub mod i2c;
 pub mod iwdg;
+pub mod pin_mux;
 pub mod rcc;
 pub mod spi;
 pub mod syscfg;

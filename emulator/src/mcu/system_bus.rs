@@ -15,6 +15,7 @@ use crate::mcu::flash_interface::FlashInterface;
 use crate::mcu::gpio::GpioPorts;
 use crate::mcu::i2c::I2c;
 use crate::mcu::iwdg::Iwdg;
+use crate::mcu::pin_mux::{self, Signal};
 use crate::mcu::rcc::{PeripheralId, Rcc, ResetCause};
 use crate::mcu::spi::Spi;
 use crate::mcu::syscfg::Syscfg;
@@ -28,8 +29,6 @@ use crate::time::Ticks;
 
 /// Base of the peripherals' address range.
 const BASE: u32 = 0x4000_0000;
-/// The alternate function that is TIM4's (STM32F405 data sheet, alternate function mapping).
-const TIM4_CHANNEL_1: u8 = 2;
 /// Bit rate of the vehicle's bus.
 const CAN_BIT_RATE: u32 = 500_000;
 /// Up to here a pad of any speed brings SPI's clock back in time. *Assumed*: the errata sheet's table was not at hand.
@@ -223,7 +222,7 @@ impl State {
             Block::Gpio => {
                 call!(self, now, gpio.write(offset, bytes, value))?;
                 self.follow_outputs(now);
-                Ok(())
+                self.check_pulls()
             }
             Block::Exti => call!(self, now, exti.write(offset, bytes, value)),
             Block::Syscfg => call!(self, now, syscfg.write(offset, bytes, value)),
@@ -239,40 +238,78 @@ impl State {
         }?;
         match block {
             Block::Rcc => self.follow_rcc(now),
-            Block::Spi1 | Block::Spi2 if offset == Spi::DATA => self.check_edges(block),
+            Block::Spi1 | Block::Spi2 if offset == Spi::DATA => self.check_spi(block),
+            Block::I2c1 if self.i2c1.uses_pins() => self.check_signals(&pin_mux::I2C1),
+            Block::Usart2 if offset == Usart::DATA => self.check_signals(&[pin_mux::USART2_TX]),
+            Block::Can1 => {
+                let rx = self.can.uses_rx().then_some(pin_mux::CAN1_RX);
+                let tx = self.can.uses_tx().then_some(pin_mux::CAN1_TX);
+                self.check_signals([rx, tx].iter().flatten())
+            }
+            Block::Adc1 => {
+                let input = self.adc1.sampled_channel().and_then(pin_mux::adc1_input);
+                self.check_signals(&input)
+            }
             _ => Ok(()),
         }
     }
 
-    /// Clock and data of an SPI master that sends have to be able to follow its clock: real pins would round the edges off. And the
-    /// clock's pad has to be fast against the clock of the APB, however slow the SPI is: what is received is strobed by what comes back
-    /// through that pad, and if it comes late the last bit is the one of the byte before (errata ES0182, corrupted last bit of data
-    /// received in master mode with delayed SCK feedback).
-    fn check_edges(&self, block: Block) -> Result<(), Unmodelled> {
-        let (spi, clock, port, pins) = if block == Block::Spi1 {
-            (&self.spi1, self.clocks.apb2, 'A', [5, 7])
-        } else {
-            (&self.spi2, self.clocks.apb1, 'B', [13, 15])
+    /// What is under way or has just begun needs its pins.
+    fn check_signals<'a>(
+        &self,
+        signals: impl IntoIterator<Item = &'a Signal>,
+    ) -> Result<(), Unmodelled> {
+        signals
+            .into_iter()
+            .try_for_each(|signal| signal.check(&self.gpio))
+    }
+
+    /// A pin stands more than VDD + 0.3 V only while its pulls are off (STM32F405 data sheet, FT pins).
+    fn check_pulls(&self) -> Result<(), Unmodelled> {
+        let pulled = |pin: &&Pin| self.gpio.is_pulled(**pin);
+        let Some(Pin { port, number }) = pins::FROM_5_V.iter().find(pulled) else {
+            return Ok(());
         };
+        let port = char::from(b'A' + port);
+        Err(Unmodelled {
+            register: format!("GPIO{port}_PUPDR"),
+            what: format!("a pull at P{port}{number}, which sees 5 V, in place of none"),
+        })
+    }
+
+    /// The signals of an SPI master that sends have to reach their pins, and clock and data to be able to follow its clock: real pins would
+    /// round the edges off. And the clock's pad has to be fast against the clock of the APB, however slow the SPI is: what is received is
+    /// strobed by what comes back through that pad, and if it comes late the last bit is the one of the byte before (errata ES0182,
+    /// corrupted last bit of data received in master mode with delayed SCK feedback).
+    fn check_spi(&self, block: Block) -> Result<(), Unmodelled> {
+        let (spi, clock, signals) = if block == Block::Spi1 {
+            (&self.spi1, self.clocks.apb2, pin_mux::SPI1)
+        } else {
+            (&self.spi2, self.clocks.apb1, pin_mux::SPI2)
+        };
+        self.check_signals(&signals)?;
+        let [sck, _, mosi] = signals.map(|signal| signal.pin);
+        let port = char::from(b'A' + sck.port);
         let clock_hz = u64::from(clock) / spi.divider();
-        let feedback_hz = self.gpio.fastest_hz(Pin::new(port, pins[0]));
+        let feedback_hz = self.gpio.fastest_hz(sck);
         if clock > SLOW_APB_HZ && feedback_hz < FEEDBACK_HZ {
             return Err(Unmodelled {
                 register: format!("GPIO{port}_OSPEEDR"),
                 what: format!(
                     "SCK of {block:?} on pin {} at an output speed for {feedback_hz} Hz: with {clock} Hz on its APB the last bit of a \
                      received byte may be wrong, expected high or very high speed",
-                    pins[0]
+                    sck.number
                 ),
             });
         }
-        for pin in pins {
-            let fastest_hz = self.gpio.fastest_hz(Pin::new(port, pin));
+        for pin in [sck, mosi] {
+            let fastest_hz = self.gpio.fastest_hz(pin);
             if clock_hz > fastest_hz {
                 return Err(Unmodelled {
                     register: format!("GPIO{port}_OSPEEDR"),
                     what: format!(
-                        "{clock_hz} Hz of {block:?} on pin {pin}, whose speed is for {fastest_hz} Hz"
+                        "{clock_hz} Hz of {block:?} on pin {}, whose speed is for {fastest_hz} Hz",
+                        pin.number
                     ),
                 });
             }
@@ -353,7 +390,7 @@ impl State {
         }
         let Pin { port, number } = pins::RANGE_GATE;
         let gate = levels[usize::from(port)] >> number & 1 != 0
-            && self.gpio.alternate(pins::RANGE_GATE) == Some(TIM4_CHANNEL_1);
+            && pin_mux::TIM4_CH1.check(&self.gpio).is_ok();
         if gate != self.tim4.gate() {
             call!(self, now, tim4.set_gate(gate));
         }
@@ -380,6 +417,9 @@ impl State {
                 self.can.inject(frame, now);
             }
             for (at, character) in self.board.line.take_due(now) {
+                if self.usart2.listens() {
+                    pin_mux::USART2_RX.check(&self.gpio)?;
+                }
                 call!(self, now, usart2.receive(character, at));
                 let follows = self.board.line.next_start(at);
                 if follows.is_some_and(|start| start < at + self.board.line.character()) {
@@ -671,20 +711,274 @@ mod tests {
     use crate::board::BoardConfig;
     use crate::scenario::{Contactors, Row, Scenario};
 
-    #[test]
-    fn a_peripheral_is_reached_with_its_clock_on_and_its_reset_over() {
-        const APB1RSTR: u32 = 0x4002_3820;
-        const APB1ENR: u32 = 0x4002_3840;
-        const TIM4: u32 = 1 << 2;
-        const TIM4_PSC: u32 = 0x4000_0828;
-        let board = Board::new(
+    const AHB1ENR: u32 = 0x4002_3830;
+    const APB1RSTR: u32 = 0x4002_3820;
+    const APB1ENR: u32 = 0x4002_3840;
+    const APB2ENR: u32 = 0x4002_3844;
+    const USART2: u32 = 0x4000_4400;
+
+    fn bus() -> SystemBus {
+        SystemBus::new(Board::new(
             BoardConfig::default(),
             Scenario::steady(Row::at_rest(0.0), Contactors::AlwaysClosed),
             Ade7753::new(Ade7753Config::default(), 0.0),
             Ads1100::new(Ads1100Config::default(), 0.0),
             W25q32::with_content(W25q32Config::default(), 0.0, Vec::new()),
-        );
-        let bus = SystemBus::new(board);
+        ))
+    }
+
+    /// The clocks of the ports and of what is tested here, from the 16 MHz of HSI.
+    fn with_clocks(bus: &SystemBus) -> MutexGuard<'_, State> {
+        let mut state = bus.lock();
+        for (register, bits) in [
+            (AHB1ENR, 0b111),
+            (APB1ENR, 1 << 2 | 1 << 14 | 1 << 17 | 1 << 21 | 1 << 25),
+            (APB2ENR, 1 << 8 | 1 << 12),
+        ] {
+            state.write(register, 4, bits, Ticks(0)).unwrap();
+        }
+        state
+    }
+
+    /// MODER, OTYPER and AFR of a pin.
+    #[derive(Clone, Copy, Debug, PartialEq)]
+    struct Setting {
+        mode: u32,
+        open_drain: u32,
+        alternate: u32,
+    }
+
+    impl Setting {
+        const fn alternate(alternate: u32) -> Self {
+            Self {
+                mode: 0b10,
+                open_drain: 0,
+                alternate,
+            }
+        }
+        const fn open_drain(alternate: u32) -> Self {
+            Self {
+                open_drain: 1,
+                ..Self::alternate(alternate)
+            }
+        }
+        const ANALOG: Self = Self {
+            mode: 0b11,
+            ..Self::alternate(0)
+        };
+    }
+
+    fn set_field(state: &mut State, register: u32, shift: u32, width: u32, value: u32) {
+        let mask = ((1 << width) - 1) << shift;
+        let was = state.read(register, 4, Ticks(0)).unwrap();
+        state
+            .write(register, 4, was & !mask | value << shift, Ticks(0))
+            .unwrap();
+    }
+
+    fn set_pin(state: &mut State, pin: Pin, setting: Setting) {
+        let port = 0x4002_0000 + 0x400 * u32::from(pin.port);
+        let number = u32::from(pin.number);
+        set_field(state, port, 2 * number, 2, setting.mode);
+        set_field(state, port + 0x04, number, 1, setting.open_drain);
+        let register = port + 0x20 + number / 8 * 4;
+        set_field(state, register, number % 8 * 4, 4, setting.alternate);
+    }
+
+    /// What makes a peripheral use its pins, and how docs/firmware.md has them.
+    struct Transfer {
+        writes: &'static [(u32, u32)],
+        /// A client's character is on the line meanwhile.
+        hears: bool,
+        pins: &'static [(&'static str, Pin, Setting)],
+    }
+
+    const TRANSFERS: [Transfer; 8] = [
+        Transfer {
+            // Master, software NSS, divider 256; a byte.
+            writes: &[(0x4001_3000, 0x037C), (0x4001_300C, 0xA5)],
+            hears: false,
+            pins: &[
+                ("SPI1_SCK", Pin::new('A', 5), Setting::alternate(5)),
+                ("SPI1_MISO", Pin::new('A', 6), Setting::alternate(5)),
+                ("SPI1_MOSI", Pin::new('A', 7), Setting::alternate(5)),
+            ],
+        },
+        Transfer {
+            writes: &[(0x4000_3800, 0x037C), (0x4000_380C, 0xA5)],
+            hears: false,
+            pins: &[
+                ("SPI2_SCK", Pin::new('B', 13), Setting::alternate(5)),
+                ("SPI2_MISO", Pin::new('B', 14), Setting::alternate(5)),
+                ("SPI2_MOSI", Pin::new('B', 15), Setting::alternate(5)),
+            ],
+        },
+        Transfer {
+            // FREQ, CCR and TRISE of fast mode; PE, then START.
+            writes: &[
+                (0x4000_5404, 16),
+                (0x4000_541C, 0x800E),
+                (0x4000_5420, 5),
+                (0x4000_5400, 1),
+                (0x4000_5400, 0x101),
+            ],
+            hears: false,
+            pins: &[
+                ("I2C1_SCL", Pin::new('B', 8), Setting::open_drain(4)),
+                ("I2C1_SDA", Pin::new('B', 9), Setting::open_drain(4)),
+            ],
+        },
+        Transfer {
+            // 115,200 baud, 8E1, transmitter alone; a character.
+            writes: &[
+                (USART2 + 0x08, 139),
+                (USART2 + 0x0C, 0x3408),
+                (USART2 + 0x04, 1),
+            ],
+            hears: false,
+            pins: &[("USART2_TX", Pin::new('A', 2), Setting::alternate(7))],
+        },
+        Transfer {
+            // Receiver alone.
+            writes: &[(USART2 + 0x08, 139), (USART2 + 0x0C, 0x3404)],
+            hears: true,
+            pins: &[("USART2_RX", Pin::new('A', 3), Setting::alternate(7))],
+        },
+        Transfer {
+            // From sleep to initialization, and on to normal mode.
+            writes: &[(0x4000_6400, 1), (0x4000_6400, 0)],
+            hears: false,
+            pins: &[
+                ("CAN1_RX", Pin::new('A', 11), Setting::alternate(9)),
+                ("CAN1_TX", Pin::new('A', 12), Setting::alternate(9)),
+            ],
+        },
+        Transfer {
+            // ADON, channel 10, SWSTART.
+            writes: &[
+                (0x4001_2008, 1),
+                (0x4001_2034, 10),
+                (0x4001_2008, 1 << 30 | 1),
+            ],
+            hears: false,
+            pins: &[("ADC1_IN10", Pin::new('C', 0), Setting::ANALOG)],
+        },
+        Transfer {
+            writes: &[
+                (0x4001_2008, 1),
+                (0x4001_2034, 11),
+                (0x4001_2008, 1 << 30 | 1),
+            ],
+            hears: false,
+            pins: &[("ADC1_IN11", Pin::new('C', 1), Setting::ANALOG)],
+        },
+    ];
+
+    impl Transfer {
+        /// With its pins as they have to be, but for `wrong`.
+        fn run(&self, wrong: Option<(Pin, Setting)>) -> Result<(), Unmodelled> {
+            let bus = bus();
+            let mut state = with_clocks(&bus);
+            let right = self.pins.iter().map(|(_, pin, setting)| (*pin, *setting));
+            for (pin, setting) in right.chain(wrong) {
+                set_pin(&mut state, pin, setting);
+            }
+            let mut now = Ticks(0);
+            for (register, value) in self.writes {
+                // The converter takes 3 µs to get stable.
+                now += Ticks::from_micros(5);
+                state.write(*register, 4, *value, now)?;
+            }
+            if self.hears {
+                let end = state.board.line.send_bytes(&[0x55], now);
+                state.advance(end)?;
+            }
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_transfer_needs_its_pins() {
+        for transfer in &TRANSFERS {
+            assert_eq!(transfer.run(None), Ok(()));
+            for (name, pin, right) in transfer.pins {
+                let mut wrong: Vec<Setting> =
+                    (0..4).map(|mode| Setting { mode, ..*right }).collect();
+                if *right != Setting::ANALOG {
+                    wrong.extend((0..16).map(|alternate| Setting {
+                        alternate,
+                        ..*right
+                    }));
+                    // Of an input the output type does not matter.
+                    if !name.ends_with("RX") && !name.ends_with("MISO") {
+                        wrong.push(Setting {
+                            open_drain: 1 - right.open_drain,
+                            ..*right
+                        });
+                    }
+                }
+                for wrong in wrong.into_iter().filter(|wrong| wrong != right) {
+                    let refused = transfer.run(Some((*pin, wrong))).unwrap_err();
+                    let port = char::from(b'A' + pin.port);
+                    assert!(
+                        refused.register.starts_with(&format!("GPIO{port}_")),
+                        "{refused}"
+                    );
+                    let place = format!("{name} on P{port}{} ", pin.number);
+                    assert!(refused.what.starts_with(&place), "{refused}");
+                }
+            }
+        }
+    }
+
+    /// What a controller does not use may be as it likes: a silent one sends nothing, in loop back mode it hears itself.
+    #[test]
+    fn can_in_test_modes_needs_fewer_pins() {
+        let [rx, tx] = [('A', 11), ('A', 12)].map(|(port, number)| Pin::new(port, number));
+        for (mode, needed) in [(0, &[rx, tx][..]), (1 << 31, &[rx]), (1 << 30, &[tx])] {
+            for connected in [&[][..], &[rx], &[tx], &[rx, tx]] {
+                let bus = bus();
+                let mut state = with_clocks(&bus);
+                for pin in connected {
+                    set_pin(&mut state, *pin, Setting::alternate(9));
+                }
+                state.write(0x4000_6400, 4, 1, Ticks(0)).unwrap();
+                state
+                    .write(0x4000_641C, 4, 0x0123_0000 | mode, Ticks(0))
+                    .unwrap();
+                let joined = state.write(0x4000_6400, 4, 0, Ticks(0));
+                assert_eq!(
+                    joined.is_ok(),
+                    needed.iter().all(|pin| connected.contains(pin)),
+                    "{mode:#x}, {connected:?}: {joined:?}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn a_pin_that_sees_5_v_has_no_pull() {
+        for (port, number) in [('A', 0), ('A', 6), ('B', 6)] {
+            let bus = bus();
+            let mut state = with_clocks(&bus);
+            let pin = Pin::new(port, number);
+            let register = 0x4002_000C + 0x400 * u32::from(pin.port);
+            for pull in [0b01, 0b10] {
+                let value = pull << (2 * number);
+                let refused = state.write(register, 4, value, Ticks(0)).unwrap_err();
+                assert_eq!(refused.register, format!("GPIO{port}_PUPDR"));
+            }
+            state
+                .write(register, 4, 0b01 << (2 * number + 2), Ticks(0))
+                .unwrap();
+        }
+    }
+
+    #[test]
+    fn a_peripheral_is_reached_with_its_clock_on_and_its_reset_over() {
+        const TIM4: u32 = 1 << 2;
+        const TIM4_PSC: u32 = 0x4000_0828;
+        let bus = bus();
         let mut state = bus.lock();
         let mut refusal = |writes: &[(u32, u32)]| {
             for (address, value) in writes {

@@ -129,6 +129,14 @@ impl Usart {
         self.longest_wait
     }
 
+    /// Offset of the data register.
+    pub const DATA: u32 = 4 * DR as u32;
+
+    /// Whether its receiver is on.
+    pub const fn listens(&self) -> bool {
+        self.receiver_since.is_some()
+    }
+
     /// Baud rate by BRR; 0 without a divider.
     pub fn baud(&self, context: &Context<'_>) -> f64 {
         if self.brr == 0 {
