@@ -24,7 +24,7 @@ pub struct StormConfig {
 
 impl StormConfig {
     /// For the range edge: 20 edges in 1 ms, that is 10 kHz, then 1 ms of rest, so that chatter of any frequency costs
-    /// at most 20 edge interrupts in 2 ms. The meter's charge is estimated meanwhile (`meter`).
+    /// at most 21 edge interrupts in 2 ms (one may be pending when it is masked). The meter's charge is estimated meanwhile (`meter`).
     pub const RANGE_EDGE: Self = Self {
         events: 20,
         window_us: 1_000,

@@ -8,7 +8,8 @@
 //! 4. BKPT at the priority of HardFault takes HardFault again instead of locking up (B1.5.15).
 //! 5. An exception return under a condition (`bxeq lr`, `popne {pc}`) advances the ITSTATE that it has just restored, so an
 //!    interrupted IT block loses an instruction's condition.
-//! 6. ICSR.VECTACTIVE is always 0 (B3.2.4). The handler of exceptions without one of their own asks it; here such a handler
+//! 6. Interrupt lines are levels alone: an edge that comes and goes while its handler runs is lost (B3.4.1).
+//! 7. ICSR.VECTACTIVE is always 0 (B3.2.4). The handler of exceptions without one of their own asks it; here such a handler
 //!    is known by serving NMI too, as in the vector table of `cortex-m-rt`.
 //!
 //! Not modelled: SLEEPONEXIT and SEVONPEND of SCR; LSPERR (a lazy push that fails is a precise bus fault); ITSTATE and FPSCR
@@ -489,8 +490,9 @@ impl Cpu {
         (self.cycles_to_systick != u64::MAX).then_some(self.cycles_to_systick)
     }
 
-    /// The levels of IRQ 0 … 95, as RM0090 table 62 numbers them.
-    pub fn set_interrupts(&mut self, levels: [u32; 3]) {
+    /// The levels of IRQ 0 … 95, as RM0090 table 62 numbers them, and which of them have risen since the last call. An edge
+    /// pends its exception also while that is being served, and for good (DDI 0403E B3.4.1); a level as [`latch`] has it.
+    pub fn set_interrupts(&mut self, levels: [u32; 3], rose: [u32; 3]) {
         for irq in 0..LINES {
             let (word, bit) = (usize::from(irq / 32), 1 << (irq % 32));
             if (levels[word] ^ self.levels[word]) & bit != 0 {
@@ -499,6 +501,11 @@ impl Cpu {
         }
         self.levels = levels;
         self.levels_by_exception = by_exception(levels);
+        self.core.with_sys(|sys| {
+            for (pending, rose) in sys.pending.iter_mut().zip(by_exception(rose)) {
+                *pending |= rose;
+            }
+        });
         self.refresh();
     }
 
@@ -529,7 +536,7 @@ impl Cpu {
         self.is_default_handler = false;
         self.is_locked_up = false;
         self.exception = 0;
-        self.set_interrupts(levels);
+        self.set_interrupts(levels, [0; 3]);
     }
 
     /// Whether the program asked for a system reset (AIRCR.SYSRESETREQ).
@@ -775,7 +782,7 @@ mod tests {
     #[test]
     fn a_line_that_stays_up_is_served_again_and_one_without_enable_never() {
         let (mut cpu, _) = program(&[WFI, BACK], &[BX_LR], &[HERE]);
-        cpu.set_interrupts([1, 0, 0]);
+        cpu.set_interrupts([1, 0, 0], [1, 0, 0]);
         assert!(!cpu.wake_pending());
         write_system(&cpu, NVIC_ISER0, 1);
         assert!(cpu.wake_pending());
@@ -785,12 +792,54 @@ mod tests {
             entries += u32::from(cpu.pc() == HANDLER);
         }
         assert!(entries >= 5, "{entries}");
-        cpu.set_interrupts([0; 3]);
+        cpu.set_interrupts([0; 3], [0; 3]);
         // What was pending is still served.
         for _ in 0..6 {
             cpu.step();
         }
         assert!(cpu.is_asleep() && !cpu.wake_pending());
+    }
+
+    /// DDI 0403E B3.4.1, and the Cortex-M4 Devices Generic User Guide 4.2.9, level-sensitive and pulse interrupts.
+    #[test]
+    fn an_edge_while_the_handler_runs_is_served_after_it() {
+        // How often the handler runs if the line falls in it, and then `pulses` more come before it returns.
+        let entries = |pulses: usize| {
+            let (mut cpu, _) = program(&[WFI, BACK], &[NOP, NOP, BX_LR], &[HERE]);
+            write_system(&cpu, NVIC_ISER0, 1);
+            cpu.set_interrupts([1, 0, 0], [1, 0, 0]);
+            cpu.step();
+            assert_eq!(cpu.current_exception(), 16);
+            cpu.set_interrupts([0; 3], [0; 3]);
+            for _ in 0..pulses {
+                cpu.set_interrupts([1, 0, 0], [1, 0, 0]);
+                cpu.set_interrupts([0; 3], [0; 3]);
+            }
+            let mut entries = 1;
+            for _ in 0..20 {
+                cpu.step();
+                entries += usize::from(cpu.pc() == HANDLER);
+            }
+            assert!(cpu.is_asleep() && !cpu.wake_pending());
+            entries
+        };
+        assert_eq!(entries(0), 1);
+        assert_eq!(entries(1), 2);
+        // One bit remembers them.
+        assert_eq!(entries(3), 2);
+    }
+
+    #[test]
+    fn a_pulse_between_two_steps_is_served_once() {
+        let (mut cpu, _) = program(&[WFI, BACK], &[BX_LR], &[HERE]);
+        write_system(&cpu, NVIC_ISER0, 1);
+        cpu.set_interrupts([0; 3], [1, 0, 0]);
+        let mut entries = 0;
+        for _ in 0..20 {
+            cpu.step();
+            entries += usize::from(cpu.pc() == HANDLER);
+        }
+        assert_eq!(entries, 1);
     }
 
     #[test]
@@ -801,7 +850,7 @@ mod tests {
             write_system(&cpu, NVIC_ISER0 + 4 * u32::from(word), bit);
             let mut levels = [0; 3];
             levels[usize::from(word)] = bit;
-            cpu.set_interrupts(levels);
+            cpu.set_interrupts(levels, levels);
             cpu.step();
             assert_eq!(cpu.current_exception(), 16 + irq);
         }
@@ -847,7 +896,7 @@ mod tests {
         let (mut cpu, ram) = program(&[HERE], &[HERE], &[HERE]);
         ram.write_at(0, &[7]).unwrap();
         write_system(&cpu, NVIC_ISER0, 1);
-        cpu.set_interrupts([1, 0, 0]);
+        cpu.set_interrupts([1, 0, 0], [1, 0, 0]);
         cpu.step();
         assert_eq!(cpu.current_exception(), 16);
         let cycles = cpu.cycles();

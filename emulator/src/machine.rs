@@ -18,7 +18,7 @@ use crate::mcu::rcc::{Rcc, ResetCause};
 use crate::mcu::system_bus::{Failure, SystemBus};
 use crate::mcu::tim2::Tim2;
 use crate::mcu::usart::Usart;
-use crate::mcu::{Unmodelled, system_memory};
+use crate::mcu::{Lines, Unmodelled, system_memory};
 use crate::outside::PORTS;
 use crate::rtt::{Log, Memory};
 use crate::time::Ticks;
@@ -415,8 +415,8 @@ impl<'table> Machine<'table> {
                 self.read_log();
                 self.next_log = self.now + LOG_PERIOD;
             }
-            if let Some(levels) = self.bus.take_interrupts() {
-                self.cpu.set_interrupts(levels);
+            if let Some(Lines { levels, rose }) = self.bus.take_interrupts() {
+                self.cpu.set_interrupts(levels, rose);
             }
             let idle = self.cpu.is_asleep() && !self.cpu.wake_pending();
             let locked_up = self.cpu.is_locked_up();

@@ -61,32 +61,41 @@ impl fmt::Display for Unmodelled {
 
 impl std::error::Error for Unmodelled {}
 
-/// Interrupt request lines (position in the vector table, RM0090 table 62). Levels: a line stays up while its
-/// peripheral asks.
+/// Interrupt request lines, one bit each, by position in the vector table (RM0090 table 62).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Lines {
+    /// Those that are up.
+    pub levels: [u32; 3],
+    /// Those that have risen since they were last looked at, whether they are still up or not: the NVIC sees each edge.
+    pub rose: [u32; 3],
+}
+
+/// The lines as the peripherals drive them. Levels: a line stays up while its peripheral asks.
 #[derive(Debug, Default)]
 pub struct Interrupts {
-    asserted: [Cell<u32>; 3],
+    lines: Cell<Lines>,
     changed: Cell<bool>,
 }
 
 impl Interrupts {
     /// Sets the level of line `irq` (0 … 95).
     pub fn set(&self, irq: u16, asserted: bool) {
-        let word = &self.asserted[usize::from(irq / 32)];
-        let bit = 1 << (irq % 32);
-        let new = if asserted {
-            word.get() | bit
-        } else {
-            word.get() & !bit
-        };
-        if new != word.replace(new) {
-            self.changed.set(true);
+        let (word, bit) = (usize::from(irq / 32), 1 << (irq % 32));
+        let mut lines = self.lines.get();
+        if (lines.levels[word] & bit != 0) == asserted {
+            return;
         }
+        lines.levels[word] ^= bit;
+        if asserted {
+            lines.rose[word] |= bit;
+        }
+        self.lines.set(lines);
+        self.changed.set(true);
     }
 
     /// Whether line `irq` is up.
     pub fn is_asserted(&self, irq: u16) -> bool {
-        self.asserted[usize::from(irq / 32)].get() >> (irq % 32) & 1 != 0
+        self.lines.get().levels[usize::from(irq / 32)] >> (irq % 32) & 1 != 0
     }
 
     /// Whether one of the lines changed since [`Interrupts::take_changed`].
@@ -95,10 +104,15 @@ impl Interrupts {
     }
 
     /// All lines, if one of them changed since the last call.
-    pub fn take_changed(&self) -> Option<[u32; 3]> {
-        self.changed
-            .replace(false)
-            .then(|| std::array::from_fn(|word| self.asserted[word].get()))
+    pub fn take_changed(&self) -> Option<Lines> {
+        self.changed.replace(false).then(|| {
+            let lines = self.lines.get();
+            self.lines.set(Lines {
+                rose: [0; 3],
+                ..lines
+            });
+            lines
+        })
     }
 }
 
@@ -151,4 +165,48 @@ pub trait Peripheral {
 
     /// Reset by RCC or by a system reset: registers to their reset values, outputs and interrupt lines off.
     fn reset(&mut self, context: &mut Context<'_>);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_edge_is_kept_until_it_was_looked_at() {
+        let interrupts = Interrupts::default();
+        assert_eq!(interrupts.take_changed(), None);
+        for irq in [0, 31, 32, 95] {
+            interrupts.set(irq, true);
+        }
+        let up = [1 << 31 | 1, 1, 1 << 31];
+        assert_eq!(
+            interrupts.take_changed(),
+            Some(Lines {
+                levels: up,
+                rose: up
+            })
+        );
+        interrupts.set(0, true);
+        assert_eq!(interrupts.take_changed(), None);
+        // Down and up again, up and down again.
+        interrupts.set(0, false);
+        interrupts.set(0, true);
+        interrupts.set(1, true);
+        interrupts.set(1, false);
+        assert_eq!(
+            interrupts.take_changed(),
+            Some(Lines {
+                levels: up,
+                rose: [0b11, 0, 0]
+            })
+        );
+        interrupts.set(95, false);
+        assert_eq!(
+            interrupts.take_changed(),
+            Some(Lines {
+                levels: [up[0], up[1], 0],
+                rose: [0; 3]
+            })
+        );
+    }
 }

@@ -22,7 +22,7 @@ use crate::mcu::syscfg::Syscfg;
 use crate::mcu::tim2::Tim2;
 use crate::mcu::tim4::Tim4;
 use crate::mcu::usart::Usart;
-use crate::mcu::{Clocks, Context, Interrupts, Peripheral, Unmodelled};
+use crate::mcu::{Clocks, Context, Interrupts, Lines, Peripheral, Unmodelled};
 use crate::outside::{Outputs, Outside, PORTS, Pin, SpiBus};
 use crate::rs485_line::LineConfig;
 use crate::time::Ticks;
@@ -553,8 +553,8 @@ impl SystemBus {
         }
     }
 
-    /// Interrupt levels, if one changed since the last call.
-    pub fn take_interrupts(&self) -> Option<[u32; 3]> {
+    /// Interrupt lines, if one changed since the last call.
+    pub fn take_interrupts(&self) -> Option<Lines> {
         self.lock().interrupts.take_changed()
     }
 

@@ -218,13 +218,13 @@ fn run(cpu: &mut Cpu, block: &[u32], interrupts: Interrupts) -> u64 {
             cpu.step();
         } else {
             // Up for the moment of the entry; what is not taken at once stays pending.
-            cpu.set_interrupts([lines, 0, 0]);
+            cpu.set_interrupts([lines, 0, 0], [lines, 0, 0]);
             let before = cpu.current_exception();
             cpu.step();
             assert_ne!(cpu.current_exception(), before, "at {:#x}", cpu.pc());
             assert!(cpu.current_exception() >= IRQ0);
             entries += u64::from(lines.count_ones());
-            cpu.set_interrupts([0; 3]);
+            cpu.set_interrupts([0; 3], [0; 3]);
         }
         if cpu.current_exception() == HARD_FAULT && cpu.fault_status().1 & HFSR_DEBUGEVT != 0 {
             return entries;
