@@ -37,7 +37,6 @@ mod verdict;
 pub mod whiten;
 pub mod workbench;
 
-use std::borrow::Cow;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -186,10 +185,7 @@ fn one(
     report: &mut Report,
     progress: &mut dyn FnMut(f64, &str),
 ) -> Part {
-    let mut course = Course {
-        problem: Cow::Borrowed(problem),
-        holdouts: Cow::Borrowed(holdouts),
-    };
+    let mut course = Course::new(problem, holdouts);
     let mut left_out = None;
     let mut answer = course.answered(options, progress);
     for _ in 0..LEAD_INS {

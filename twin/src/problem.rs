@@ -3,6 +3,7 @@
 //! Recording and model file become one [`Problem`] for each signal that can be compared. Everything after that
 //! (location, effects, selection) knows nothing of files.
 
+mod begin;
 mod holds;
 mod smooth;
 
@@ -283,6 +284,8 @@ pub struct BatteryBase {
     pub current_zero_a: f64,
     /// Standard uncertainty of [`BatteryBase::current_zero_a`]; 0: exact.
     pub current_zero_sigma_a: f64,
+    /// Standard uncertainty of the current that flowed before the recording, beside none, in A; 0: the battery had rested.
+    pub before_sigma_a: f64,
     /// Time by which voltages were read before the current of their row, in s.
     pub alignment_s: f64,
 }

@@ -16,6 +16,8 @@ pub struct Nuisance {
     pub resistance: f64,
     /// Added to what the recorded current is above the battery's, in A.
     pub current_zero_a: f64,
+    /// Current in A that would have led, had it flowed for long, to what the battery remembers when the recording begins.
+    pub before_a: f64,
     /// Lowest and highest temperature, in °C, at which the resistances were found, where the model file states none.
     pub resistances_at_c: Option<[f64; 2]>,
     /// What the open-circuit voltage of a cell is above each line of its table, half-way between its points, in V; nothing where there is
@@ -88,6 +90,8 @@ pub enum Change {
     Resistance,
     /// [`Nuisance::current_zero_a`].
     CurrentZero,
+    /// [`Nuisance::before_a`].
+    Before,
     /// [`Nuisance::ocv_bend_v`].
     OcvBend,
     /// [`Nuisance::alignment_s`].
@@ -99,7 +103,7 @@ fn first(links: &[Link<'_>], change: Change) -> usize {
     let tells = |link: &Link<'_>| match (change, link) {
         (Change::Member(index), Link::Effect(_, _, member)) => *member == Some(index),
         (Change::CurrentZero, Link::Zero)
-        | (Change::SocShift, Link::Count)
+        | (Change::SocShift | Change::Before, Link::Count)
         | (Change::Resistance | Change::OcvBend, Link::Terminals)
         | (Change::Alignment, Link::Sample) => true,
         _ => false,
@@ -343,6 +347,7 @@ impl<'a> Chain<'a> {
                 if let Some(battery) = &mut scene.battery {
                     battery.soc_shift.clone_from(&nuisance.soc_shift);
                     battery.gap_soc_shift.clone_from(&nuisance.gap_soc_shift);
+                    battery.before_a = nuisance.before_a;
                     battery.count(scene.drive, &scene.signal);
                     if self.problem.view != View::StateOfCharge {
                         battery.open_circuit();

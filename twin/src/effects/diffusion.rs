@@ -92,7 +92,7 @@ impl Effect for Diffusion {
         let mut drop = steps.ladder(
             &drive.operations(),
             &driven,
-            &battery.driven_over_gaps(),
+            (&battery.driven_over_gaps(), battery.driven_before()),
             taus.map(|share| share * tau),
             weights.map(|share| share * ohms),
         );

@@ -103,12 +103,14 @@ impl Effect for Polarisation {
             .map(|(i, factor)| i * factor)
             .collect();
         let segments = &drive.operations();
-        let gaps = &battery.driven_over_gaps();
+        let outside = (&battery.driven_over_gaps()[..], battery.driven_before());
         let v = match *values {
-            [r1, tau1] => steps.ladder(segments, &driven, gaps, [tau1], [r1]),
-            [r1, tau1, r2, tau2] => steps.ladder(segments, &driven, gaps, [tau1, tau2], [r1, r2]),
+            [r1, tau1] => steps.ladder(segments, &driven, outside, [tau1], [r1]),
+            [r1, tau1, r2, tau2] => {
+                steps.ladder(segments, &driven, outside, [tau1, tau2], [r1, r2])
+            }
             [r1, tau1, r2, tau2, r3, tau3] => {
-                steps.ladder(segments, &driven, gaps, [tau1, tau2, tau3], [r1, r2, r3])
+                steps.ladder(segments, &driven, outside, [tau1, tau2, tau3], [r1, r2, r3])
             }
             _ => return,
         };

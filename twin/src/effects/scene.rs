@@ -109,6 +109,8 @@ pub struct Battery<'a> {
     pub soc_shift: Vec<f64>,
     /// Added to it over the gap before each segment.
     pub gap_soc_shift: Vec<f64>,
+    /// Current in A that flowed for long before the first operation.
+    pub before_a: f64,
     /// Where a gap ends over which the charge is not known, and the mean current that its charge makes there, in A: of the rows at its ends
     /// neither says what flowed in it. Filled where the charge is counted.
     pub gap_mean_a: Vec<(usize, f64)>,
@@ -381,13 +383,14 @@ impl Steps {
         output
     }
 
-    /// A sum of first-order low-passes of a current, each with a weight, all at rest when a segment begins: one pass over the rows.
+    /// A sum of first-order low-passes of a current, each with a weight: one pass over the rows. When the first segment begins all are where
+    /// `before` leads in the long run, when another one begins at rest.
     /// Between the rows it goes as [`Drive::mean_share`] says, and over the step to one of `gaps` it is what is said there.
     pub fn ladder<const N: usize>(
         &self,
         segments: &[Range<usize>],
         input: &[f64],
-        gaps: &[(usize, f64)],
+        (gaps, before): (&[(usize, f64)], f64),
         taus_s: [f64; N],
         weights: [f64; N],
     ) -> Vec<f64> {
@@ -402,6 +405,10 @@ impl Steps {
         }
         for rows in segments.iter().filter(|rows| !rows.is_empty()) {
             let mut last = [0.0; N];
+            if before != 0.0 && segments.first() == Some(rows) {
+                last = weights.map(|weight| weight * before);
+                output[rows.start] = last.iter().sum();
+            }
             let mut step = |kind: u32, pair: [f64; 2]| {
                 let [kept, from, to] = &of_kind[kind as usize];
                 let mut sum = 0.0;
@@ -817,6 +824,7 @@ impl<'a> Battery<'a> {
             },
             soc_shift: Vec::new(),
             gap_soc_shift: Vec::new(),
+            before_a: 0.0,
             gap_mean_a: Vec::new(),
             resistance: 1.0,
             soc: Series::default(),
@@ -879,6 +887,11 @@ impl<'a> Battery<'a> {
             (*row, mean_a * factor)
         })
         .collect()
+    }
+
+    /// What drives the branches in the long run before the first operation, in A: with the factor of resistance that it begins with.
+    pub fn driven_before(&self) -> f64 {
+        self.before_a * self.factor.first().copied().unwrap_or(1.0)
     }
 
     /// Looks up the open-circuit voltage: after the charge is counted.

@@ -20,6 +20,53 @@ pub(super) struct Course<'a> {
     pub(super) holdouts: Cow<'a, [Holdout]>,
 }
 
+/// What a battery's problem may be beside what it is: a form of it that the model file does not exclude.
+#[derive(Clone, Copy)]
+enum Form {
+    /// [`Problem::with_holding`].
+    Holding(Holds),
+    /// [`Problem::with_open_begin`].
+    OpenBegin,
+}
+
+impl Form {
+    fn of(self, problem: &Problem) -> Problem {
+        match self {
+            Self::Holding(holds) => problem.with_holding(holds),
+            Self::OpenBegin => problem.with_open_begin(),
+        }
+    }
+
+    /// All is decided again from this gain on of what was named. Nothing but a counter tells what a current does between its rows, so that what
+    /// is as good counts; what a log begins with is its first minutes'.
+    fn asked_from(self) -> f64 {
+        match self {
+            Self::Holding(_) => -CLEARLY,
+            Self::OpenBegin => CLEARLY,
+        }
+    }
+
+    /// What is held against a name that turns on it.
+    fn but_if(self) -> String {
+        match self {
+            Self::Holding(holds) => format!(
+                "not if each row's current {}, which no counter tells (current_holds = \"{}\" in [battery])",
+                holds.in_words(),
+                holds.as_str()
+            ),
+            Self::OpenBegin => {
+                "not if another current flowed before the recording, which begins under load or not long after"
+                    .to_owned()
+            }
+        }
+    }
+}
+
+/// The error that a fit leaves, rms.
+fn left(fit: &Fit) -> f64 {
+    rms(fit.residual.iter().copied())
+}
+
 /// What is decided about a signal, on the course of the reference that it is decided on.
 pub(super) struct Answer {
     /// The course, if it is not in straight lines.
@@ -42,7 +89,7 @@ impl Answer {
     }
 
     fn on(other: Course<'static>, (decided, shown): (Decided, Fit), straight: &Fit) -> Self {
-        let errors = [straight, &shown].map(|fit| rms(fit.residual.iter().copied()));
+        let errors = [straight, &shown].map(left);
         Self {
             other: Some(other),
             decided,
@@ -63,6 +110,27 @@ impl Answer {
             return lead_in::missed(&bench, &course.nearest(options)?);
         }
         lead_in::missed(&bench, &self.shown)
+    }
+}
+
+impl<'a> Course<'a> {
+    /// Straight lines. What flowed before a file that was never fitted is that file's own, as its start is.
+    pub(super) fn new(problem: &'a Problem, holdouts: &'a [Holdout]) -> Self {
+        let course = Self {
+            problem: Cow::Borrowed(problem),
+            holdouts: Cow::Borrowed(holdouts),
+        };
+        let open = |one: &Problem| one.begins_loaded();
+        if !holdouts
+            .iter()
+            .any(|holdout| holdout.problems.iter().any(open))
+        {
+            return course;
+        }
+        Course {
+            problem: course.problem.clone(),
+            ..course.with(problem.clone(), Problem::with_open_begin)
+        }
     }
 }
 
@@ -161,43 +229,68 @@ impl Course<'_> {
         Answer::straight((decided, shown))
     }
 
-    /// The same of a battery, whose current may stay at one value between its rows, where that makes a charge that no counter tells.
+    /// The same of a battery, of which the model file leaves open what its current does between its rows, and did before the first.
     fn answered_of_battery(
         &self,
         options: &Options,
         progress: &mut dyn FnMut(f64, &str),
     ) -> Answer {
-        let (mut decided, shown) = self.decided(options, progress);
-        if decided.verdict == Verdict::NoMismatch || !self.problem.may_hold() {
-            return Answer::straight((decided, shown));
+        let mut answer = Answer::straight(self.decided(options, progress));
+        if self.problem.may_hold() {
+            let holds = Holds::ALL.map(Form::Holding);
+            answer = self.answered_or(answer, &holds, options, progress);
         }
-        let model = decided.selection.fit.model.clone();
-        let nearest = Holds::ALL
-            .map(|holds| {
-                let form = |problem: &Problem| problem.with_holding(holds);
-                let course = self.with(form(&self.problem), form);
-                let gained = gained(&shown, &course.left_by(&model));
-                (holds, course, gained)
+        if self.problem.begins_loaded() {
+            answer = self.answered_or(answer, &[Form::OpenBegin], options, progress);
+        }
+        answer
+    }
+
+    /// An answer, or that on the form of the problem that what was named fits best, if it is clearly better.
+    fn answered_or(
+        &self,
+        mut answer: Answer,
+        forms: &[Form],
+        options: &Options,
+        progress: &mut dyn FnMut(f64, &str),
+    ) -> Answer {
+        if answer.decided.verdict == Verdict::NoMismatch {
+            return answer;
+        }
+        let here = answer.other.as_ref().unwrap_or(self);
+        let model = &answer.decided.selection.fit.model;
+        let nearest = forms
+            .iter()
+            .map(|form| {
+                let course = here.with(form.of(&here.problem), |other| form.of(other));
+                let gained = gained(&answer.shown, &course.left_by(model));
+                (form, course, gained)
             })
-            .into_iter()
             .max_by(|one, other| one.2.total_cmp(&other.2));
-        let Some((holds, course, nearer)) = nearest else {
-            return Answer::straight((decided, shown));
+        let Some((form, course, nearer)) = nearest else {
+            return answer;
         };
-        if !decided.names_nothing() && nearer <= -CLEARLY {
-            return Answer::straight((decided, shown));
+        if !answer.decided.names_nothing() && nearer <= form.asked_from() {
+            return answer;
         }
         let (again, there) = course.decided(options, progress);
-        let better = gained(&shown, &there);
+        let better = gained(&answer.shown, &there);
         if better > CLEARLY {
-            return Answer::on(course, (again, there), &shown);
+            let straight = answer
+                .between
+                .map_or_else(|| left(&answer.shown), |[straight, _]| straight);
+            return Answer {
+                between: Some([straight, left(&there)]),
+                ..Answer::on(course, (again, there), &answer.shown)
+            };
         }
         // As good either way, and what is named turns on it.
-        if better > -CLEARLY && !decided.names_nothing() && again.names() != decided.names() {
-            decided.verdict = Verdict::Ambiguous;
-            decided.but = Some(holds.but_if());
+        let names = answer.decided.names();
+        if better > -CLEARLY && !names.is_empty() && again.names() != names {
+            answer.decided.verdict = Verdict::Ambiguous;
+            answer.decided.but = Some(form.but_if());
         }
-        Answer::straight((decided, shown))
+        answer
     }
 
     /// The same without the readings that reach so far, in s, out of their stretch ([`lead_in`]).

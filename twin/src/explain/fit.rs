@@ -7,6 +7,7 @@ use std::sync::{Arc, OnceLock};
 use super::normal::{dot, forget, normal, solve, sum_of};
 use super::robust::{huber, loss, weight};
 use super::slope::{Slope, change, coordinates, rounds, slope, unrounded};
+use super::starts;
 use super::workbench::{Model, Workbench};
 use crate::effects::chain::Begun;
 use crate::effects::{Says, Search};
@@ -323,7 +324,10 @@ fn descend(aim: Aim<'_, '_>, here: &mut Point, known: Option<Slope>) -> Option<S
             normal(&slope.columns, &weights, &here.residual, 0..bench.len());
         slope.penalty(&mut matrix, &mut right);
         if let Some(used) = used {
-            let untold = slope.starts(|start, _| !bench.starts[start].told_by(used));
+            let untold = slope.starts(|start, k| match start {
+                Some(start) => !bench.starts[start].told_by(used),
+                None => !starts::told(&slope.columns[k], used),
+            });
             forget(&untold, &mut matrix);
         }
         let mut gain = 0.0;

@@ -39,7 +39,9 @@ pub fn held_out(bench: &Workbench<'_>, fit: &Fit, sigma: f64) -> Vec<Vec<f64>> {
             rows.map(of_row).sum()
         };
         slope.starts(|start, k| {
-            let start = &bench.starts[start];
+            let Some(start) = start.map(|start| &bench.starts[start]) else {
+                return starts::within_block(here[(k, k)], total[(k, k)] - slope.prior[k]);
+            };
             if !start.is_shared() {
                 let all = total[(k, k)] - slope.prior[k];
                 return bench.starts.len() > 1 && starts::within_block(here[(k, k)], all);

@@ -18,6 +18,8 @@ pub const BASE_OFF: f64 = 4.0;
 const SMALL_BEND: f64 = 1e-3;
 /// The same of a current's zero.
 const SMALL_ZERO: f64 = 1e-3;
+/// The same of what flowed before the recording.
+const SMALL_BEFORE: f64 = 1e-3;
 
 /// Whether a value of the base stands at that end, by how many of its standard uncertainties it is off.
 pub(super) fn at_base_end(deviations: f64) -> bool {
@@ -33,6 +35,7 @@ pub(super) enum Coordinate {
     SocShift(usize),
     Resistance,
     CurrentZero,
+    Before,
     /// Index of the line, among those of the bench that bend.
     OcvBend(usize),
     Alignment,
@@ -46,6 +49,7 @@ impl Coordinate {
             Self::SocShift(_) => Change::SocShift,
             Self::Resistance => Change::Resistance,
             Self::CurrentZero => Change::CurrentZero,
+            Self::Before => Change::Before,
             Self::OcvBend(_) => Change::OcvBend,
             Self::Alignment => Change::Alignment,
         }
@@ -139,6 +143,7 @@ impl Slope {
                 Coordinate::SocShift(start) => bench.starts[*start].at(&model.nuisance),
                 Coordinate::Resistance => model.nuisance.resistance,
                 Coordinate::CurrentZero => model.nuisance.current_zero_a,
+                Coordinate::Before => model.nuisance.before_a,
                 Coordinate::OcvBend(bend) => bend_at(bench, *bend, &model.nuisance),
                 _ => *at,
             };
@@ -160,11 +165,12 @@ impl Slope {
         (0..self.len()).filter(at_end).collect()
     }
 
-    /// Coordinates of the starts, each with the index of its start, that are not told: how an operation began is no physics that
-    /// another one could tell.
-    pub(super) fn starts(&self, untold: impl Fn(usize, usize) -> bool) -> Vec<usize> {
+    /// Coordinates of the starts, each with the index of its start (none: what flowed before the recording), that are not told: how an
+    /// operation began is no physics that another one could tell.
+    pub(super) fn starts(&self, untold: impl Fn(Option<usize>, usize) -> bool) -> Vec<usize> {
         let is_untold = |k: &usize| match self.coordinates[*k] {
-            Coordinate::SocShift(start) => untold(start, *k),
+            Coordinate::SocShift(start) => untold(Some(start), *k),
+            Coordinate::Before => untold(None, *k),
             _ => false,
         };
         (0..self.len()).filter(is_untold).collect()
@@ -196,9 +202,17 @@ pub(super) fn current_zero_sigma_a(bench: &Workbench<'_>, model: &Model) -> Opti
     }
 }
 
-/// A zero of the recorded current within what its standard uncertainty allows, both in A.
-pub(super) fn current_zero_within_a(zero_a: f64, sigma_a: f64) -> f64 {
-    zero_a.clamp(-BASE_OFF * sigma_a, BASE_OFF * sigma_a)
+/// Standard uncertainty of the current that flowed before the recording, in A, if it is open.
+pub(super) fn before_sigma_a(bench: &Workbench<'_>) -> Option<f64> {
+    match &bench.problem.base {
+        Base::Battery(base) => Some(base.before_sigma_a).filter(|sigma_a| *sigma_a > 0.0),
+        Base::Sensor(_) => None,
+    }
+}
+
+/// A value that is 0 by design within what its standard uncertainty allows.
+pub(super) fn within(value: f64, sigma: f64) -> f64 {
+    value.clamp(-BASE_OFF * sigma, BASE_OFF * sigma)
 }
 
 /// Whether a value of the base stands where its uncertainty ends, and the residual would have it beyond: it is free no more, and
@@ -233,7 +247,11 @@ fn shift(bench: &Workbench<'_>, model: &mut Model, coordinate: Coordinate, delta
         Coordinate::CurrentZero => {
             let sigma_a = current_zero_sigma_a(bench, model).unwrap_or_default();
             let zero_a = model.nuisance.current_zero_a + delta;
-            model.nuisance.current_zero_a = current_zero_within_a(zero_a, sigma_a);
+            model.nuisance.current_zero_a = within(zero_a, sigma_a);
+        }
+        Coordinate::Before => {
+            let sigma_a = before_sigma_a(bench).unwrap_or_default();
+            model.nuisance.before_a = within(model.nuisance.before_a + delta, sigma_a);
         }
         Coordinate::OcvBend(bend) => {
             let (line, sigma_v) = bench.bends[bend];
@@ -323,6 +341,14 @@ pub(super) fn coordinates(
                 SMALL_ZERO * sigma_a,
                 inverse(sigma_a),
                 model.nuisance.current_zero_a,
+            ));
+        }
+        if let Some(sigma_a) = before_sigma_a(bench) {
+            all.push((
+                Coordinate::Before,
+                SMALL_BEFORE * sigma_a,
+                inverse(sigma_a),
+                model.nuisance.before_a,
             ));
         }
         for (index, (_, sigma_v)) in bench.bends.iter().enumerate() {

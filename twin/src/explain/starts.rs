@@ -1,4 +1,4 @@
-//! What is each recording's own: at which state of charge each operation begins, what flowed over its gaps, and the zero of the current.
+//! What is each recording's own: at which state of charge each operation begins, what flowed over its gaps and before it, and the zero of the current.
 //! It is fitted beside every model, and in every file.
 
 use std::ops::Range;
@@ -7,7 +7,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::normal::{dot, solve};
 use super::robust::{huber, spread, weights};
-use super::slope::{BASE_OFF, current_zero_sigma_a, current_zero_within_a};
+use super::slope::{BASE_OFF, before_sigma_a, current_zero_sigma_a, within};
 use super::workbench::{Model, Workbench};
 use crate::effects::chain::Nuisance;
 use crate::problem::{Base, BatteryBase, Problem};
@@ -21,8 +21,8 @@ const MOST_GAPS: usize = 24;
 const HALF: f64 = 0.5;
 /// Steps in which the starts of a file are found that is not fitted otherwise: the open-circuit voltage bends.
 const STEPS: usize = 4;
-/// The same of the zero of its current.
-const ZERO_STEPS: usize = 3;
+/// The same of what flowed before, and of the zero of its current.
+const OWN_STEPS: usize = 3;
 /// A step is the last one if the loss falls by less than this share.
 const GAINED: f64 = 1e-4;
 /// A small step of a state of charge.
@@ -265,23 +265,76 @@ pub(super) fn within_block(block: f64, all: f64) -> bool {
     block > (1.0 - HALF) * all
 }
 
-/// A model as it is taken to a recording that it was not fitted to: where each operation starts, and the zero of the recorded current, are
-/// that recording's own, those that fit it best, each within its uncertainty; everything else is as it is. And what it leaves.
-pub(super) fn begun(bench: &Workbench<'_>, model: Model) -> (Model, Vec<f64>) {
-    let with_zero = |model: &Model, zero_a: f64| {
+/// Whether what is in use of the readings holds most of what all of them tell of a value, by what it changes in each.
+pub(super) fn told(column: &[f64], used: &[f64]) -> bool {
+    let squares = || column.iter().map(|change| change * change);
+    let in_use: f64 = squares()
+        .zip(used)
+        .map(|(square, used)| square * used)
+        .sum();
+    in_use >= HALF * squares().sum::<f64>()
+}
+
+/// A current that is a recording's own, 0 as far as the model file knows.
+#[derive(Clone, Copy)]
+enum Own {
+    /// [`Nuisance::before_a`].
+    Before,
+    /// [`Nuisance::current_zero_a`].
+    Zero,
+}
+
+impl Own {
+    /// Its standard uncertainty in A, if it is open.
+    fn sigma_a(self, bench: &Workbench<'_>, model: &Model) -> Option<f64> {
+        match self {
+            Self::Before => before_sigma_a(bench),
+            Self::Zero => current_zero_sigma_a(bench, model),
+        }
+    }
+
+    fn of(self, nuisance: &mut Nuisance) -> &mut f64 {
+        match self {
+            Self::Before => &mut nuisance.before_a,
+            Self::Zero => &mut nuisance.current_zero_a,
+        }
+    }
+}
+
+/// A model as it is taken to a recording that it was not fitted to: where each operation starts, what flowed before, and the zero of the
+/// recorded current, are that recording's own, those that fit it best, each within its uncertainty; everything else is as it is. And what
+/// it leaves.
+pub(super) fn begun(bench: &Workbench<'_>, mut model: Model) -> (Model, Vec<f64>) {
+    let own = [Own::Before, Own::Zero];
+    for one in own {
+        *one.of(&mut model.nuisance) = 0.0;
+    }
+    let open = own.map(|one| one.sigma_a(bench, &model).map(|sigma_a| (one, sigma_a)));
+    let open: Vec<(Own, f64)> = open.into_iter().flatten().collect();
+    let mut here = with_starts(bench, model);
+    for one in &open {
+        here = with_own(bench, here, *one, &open);
+    }
+    here
+}
+
+/// The same with one current that fits best, and the starts with it.
+fn with_own(
+    bench: &Workbench<'_>,
+    mut here: (Model, Vec<f64>),
+    (one, sigma_a): (Own, f64),
+    open: &[(Own, f64)],
+) -> (Model, Vec<f64>) {
+    let with = |model: &Model, current_a: f64| {
         let mut model = model.clone();
-        model.nuisance.current_zero_a = zero_a;
+        *one.of(&mut model.nuisance) = current_a;
         with_starts(bench, model)
     };
-    let mut here = with_zero(&model, 0.0);
-    let Some(sigma_a) = current_zero_sigma_a(bench, &model) else {
-        return here;
-    };
-    for _ in 0..ZERO_STEPS {
-        let zero_a = here.0.nuisance.current_zero_a;
-        // The starts follow: what the zero changes beside them.
-        let by = if zero_a > 0.0 { -sigma_a } else { sigma_a };
-        let moved = with_zero(&here.0, zero_a + by);
+    for _ in 0..OWN_STEPS {
+        let now_a = *one.of(&mut here.0.nuisance);
+        // The starts follow: what the current changes beside them.
+        let by = if now_a > 0.0 { -sigma_a } else { sigma_a };
+        let moved = with(&here.0, now_a + by);
         let sigma = spread(&here.1);
         let weight = weights(&here.1, sigma);
         let change = super::slope::change(&here.1, &moved.1);
@@ -292,16 +345,19 @@ pub(super) fn begun(bench: &Workbench<'_>, model: Model) -> (Model, Vec<f64>) {
             .collect();
         let prior = sigma_a.powi(-2);
         let step =
-            (dot(&weighted, &here.1) - prior * zero_a) / (dot(&weighted, &change) / by + prior);
-        let tried = with_zero(&here.0, current_zero_within_a(zero_a + step, sigma_a));
-        let cost = |(model, residual): &(Model, Vec<f64>)| {
+            (dot(&weighted, &here.1) - prior * now_a) / (dot(&weighted, &change) / by + prior);
+        let mut tried = with(&here.0, within(now_a + step, sigma_a));
+        let cost = |(model, residual): &mut (Model, Vec<f64>)| {
             let starts = bench.starts.iter();
             let off = starts.map(|start| start.at(&model.nuisance) / start.sigma);
-            let off = off.chain([model.nuisance.current_zero_a / sigma_a]);
+            let mut off: Vec<f64> = off.collect();
+            for (one, sigma_a) in open {
+                off.push(*one.of(&mut model.nuisance) / sigma_a);
+            }
             residual.iter().map(|r| huber(r / sigma)).sum::<f64>()
-                + 0.5 * off.map(|off| off * off).sum::<f64>()
+                + 0.5 * off.iter().map(|off| off * off).sum::<f64>()
         };
-        let (from, to) = (cost(&here), cost(&tried));
+        let (from, to) = (cost(&mut here), cost(&mut tried));
         if to < from {
             here = tried;
         }

@@ -491,18 +491,39 @@ pub(super) fn times_found(
             if later_s > 0.0 { "before" } else { "after" },
         ),
     });
-    let course = course.map(|[straight, other]| {
-        let goes = match bench.problem.drive.holds {
-            None => "between its rows the reference is taken to go smoothly".to_owned(),
-            Some(holds) => format!("each row's current {}", holds.in_words()),
-        };
-        format!(
-            "{name}: {goes} (error {} {unit}, with straight lines {} {unit})",
+    let course = course.and_then(|[straight, other]| {
+        let (goes, instead) = goes(bench.problem, &fit.model.nuisance)?;
+        Some(format!(
+            "{name}: {goes} (error {} {unit}, {instead} {} {unit})",
             short(other),
             short(straight)
-        )
+        ))
     });
     aligned.into_iter().chain(course).collect()
+}
+
+/// How the reference of a problem goes where its rows do not say, and what it would do otherwise.
+fn goes(problem: &Problem, nuisance: &Nuisance) -> Option<(String, &'static str)> {
+    const STRAIGHT: &str = "with straight lines";
+    if matches!(problem.base, Base::Sensor(_)) {
+        let smooth = "between its rows the reference is taken to go smoothly";
+        return Some((smooth.to_owned(), STRAIGHT));
+    }
+    let holds = problem.drive.holds;
+    let instead = if holds.is_some() {
+        STRAIGHT
+    } else {
+        "after a rest"
+    };
+    let holds = holds.map(|holds| format!("each row's current {}", holds.in_words()));
+    let before = (nuisance.before_a != 0.0).then(|| {
+        format!(
+            "the recording begins under load, or not long after, and what the battery remembers then is as after {} A for long",
+            short(nuisance.before_a)
+        )
+    });
+    let both: Vec<String> = holds.into_iter().chain(before).collect();
+    (!both.is_empty()).then(|| (both.join("; "), instead))
 }
 
 /// What error of a battery's recorded current would look the same as a named effect, and whether that is likelier than the effect.

@@ -219,6 +219,7 @@ fn key(model: &Model) -> Key {
                 &[
                     nuisance.resistance,
                     nuisance.current_zero_a,
+                    nuisance.before_a,
                     nuisance.alignment_s,
                 ],
             ]

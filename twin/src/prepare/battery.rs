@@ -132,6 +132,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
             resistances_at_c: battery.resistances_at_c,
             current_zero_a: battery.current_zero_a,
             current_zero_sigma_a: battery.current_zero_uncertainty_a,
+            before_sigma_a: 0.0,
             alignment_s: match view {
                 View::Voltage => battery.alignment_s,
                 _ => 0.0,

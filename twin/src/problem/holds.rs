@@ -43,15 +43,6 @@ impl Holds {
         }
     }
 
-    /// What is held against a name that turns on it.
-    pub fn but_if(self) -> String {
-        format!(
-            "not if each row's current {}, which no counter tells (current_holds = \"{}\" in [battery])",
-            self.in_words(),
-            self.as_str()
-        )
-    }
-
     /// [`Drive::mean_share`] of every step.
     fn mean_share(self) -> f64 {
         match self {
