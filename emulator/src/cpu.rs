@@ -1,6 +1,6 @@
 //! The Cortex-M4 core of the STM32F405: `rsemu`'s, with what its exception entry loses put back.
 //!
-//! `rsemu` 0.0.7 departs from the architecture (DDI 0403E B1.5) where an exception is taken:
+//! `rsemu` 0.0.7 departs from the architecture (DDI 0403E B1.5), mostly where an exception is taken:
 //! 1. ITSTATE is missing from the stacked xPSR (B1.5.6, PushStack), so an interrupted IT block goes on unconditionally.
 //! 2. FPSCR is overwritten by FPDSCR at entry, also at tail-chaining. The register must keep its value until the handler's
 //!    first floating-point instruction (A2.5, ExecuteFPCheck): the lazy push saves it, or nobody touches it at all.
@@ -11,9 +11,11 @@
 //! 6. Interrupt lines are levels alone: an edge that comes and goes while its handler runs is lost (B3.4.1).
 //! 7. ICSR.VECTACTIVE is always 0 (B3.2.4). The handler of exceptions without one of their own asks it; here such a handler
 //!    is known by serving NMI too, as in the vector table of `cortex-m-rt`.
+//! 8. SysTick counts HCLK whatever CLKSOURCE says (B3.3.3).
 //!
 //! Not modelled: SLEEPONEXIT and SEVONPEND of SCR; LSPERR (a lazy push that fails is a precise bus fault); ITSTATE and FPSCR
-//! in the frame of a synchronous fault, from which the firmware never returns; VECTACTIVE in handlers of their own.
+//! in the frame of a synchronous fault, from which the firmware never returns; VECTACTIVE in handlers of their own; SYST_CALIB;
+//! a reload value of 0 written while SysTick's clock is HCLK / 8, which leaves the one before.
 //! `emulator/tests/cpu_differential` compares the rest with QEMU.
 //!
 //! [`Cpu`] looks at the core's state only where one of them can happen: before an instruction when an interrupt is about
@@ -45,6 +47,12 @@ const FRAME_FPSCR: u32 = 0x40;
 const FPSCR_MODES: u32 = 0x07C0_0000;
 /// SysTick may pend its exception.
 const SYST_CSR_TICKINT: u32 = 1 << 1;
+/// SysTick counts HCLK, else HCLK / [`SLOW_SYSTICK`].
+const SYST_CSR_CLKSOURCE: u32 = 1 << 2;
+/// SysTick Reload Value Register.
+const SYST_RVR: u32 = 0xE000_E014;
+/// What divides HCLK for SysTick's other clock (RM0090, clock tree).
+const SLOW_SYSTICK: u64 = 8;
 /// Interrupt Control and State Register.
 const ICSR: u32 = 0xE000_ED04;
 
@@ -62,6 +70,12 @@ pub struct Cpu {
     is_exception_due: bool,
     /// Cycles to the wrap of SysTick that pends its exception; `u64::MAX` if none will.
     cycles_to_systick: u64,
+    /// SysTick counts by its other clock, or would if it were on.
+    is_systick_slow: bool,
+    /// Cycles of that clock's present period.
+    systick_phase: u64,
+    /// The reload value while `rsemu` is not to see it.
+    hidden_reload: u32,
     /// Repairs are on.
     is_repaired: bool,
     /// Where the frame is whose floating-point part has been reserved, and the FPSCR that belongs there.
@@ -114,6 +128,9 @@ impl Cpu {
             cycles: 0,
             is_exception_due: false,
             cycles_to_systick: u64::MAX,
+            is_systick_slow: false,
+            systick_phase: 0,
+            hidden_reload: 0,
             is_repaired: true,
             reserved: None,
             is_new_fp_mode_due: false,
@@ -134,6 +151,9 @@ impl Cpu {
     /// Executes one instruction, exception entry or reset sequence; the cycles it took (`rsemu`'s timing: Cortex-M4 TRM
     /// without wait states and prefetch). A sleeping or locked-up core takes 1.
     pub fn step(&mut self) -> u64 {
+        if self.is_systick_slow {
+            return self.step_with_slow_systick();
+        }
         if self.needs_care() {
             return self.step_with_care();
         }
@@ -176,6 +196,37 @@ impl Cpu {
             || self.is_locked_up
     }
 
+    /// A step while SysTick's clock is HCLK / 8: `rsemu` would count HCLK, but counts nothing without a reload value.
+    fn step_with_slow_systick(&mut self) -> u64 {
+        self.hidden_reload = self.core.with_sys(|sys| std::mem::take(&mut sys.syst_rvr));
+        let used = self.step_with_care();
+        let reload = std::mem::take(&mut self.hidden_reload);
+        self.core.with_sys(|sys| {
+            if sys.syst_rvr == 0 {
+                sys.syst_rvr = reload;
+            }
+        });
+        self.count_systick(used);
+        self.refresh();
+        used
+    }
+
+    /// Lets SysTick count for `cycles` of HCLK.
+    fn count_systick(&mut self, cycles: u64) {
+        let phase = &mut self.systick_phase;
+        self.core.with_sys(|sys| {
+            let mut counts = cycles;
+            if is_systick_slow(sys) {
+                *phase += cycles;
+                counts = *phase / SLOW_SYSTICK;
+                *phase %= SLOW_SYSTICK;
+            }
+            if sys.tick_systick(counts) && sys.syst_csr & SYST_CSR_TICKINT != 0 {
+                sys.set_pending(Exception::SYSTICK, true);
+            }
+        });
+    }
+
     /// A step at which an exception may be taken, or which must not be executed as `rsemu` would.
     fn step_with_care(&mut self) -> u64 {
         if self.is_locked_up {
@@ -196,17 +247,16 @@ impl Cpu {
         if due.is_some_and(|(_, priority)| priority < self.core.execution_priority()) {
             return self.enter_exception(faults);
         }
-        let next = (self.is_default_handler || self.is_new_fp_mode_due)
+        let next = (self.is_default_handler || self.is_new_fp_mode_due || self.hidden_reload != 0)
             .then(|| self.next_instruction())
             .flatten();
         if self.is_new_fp_mode_due && matches!(next, Some(Insn::Fp(_))) {
             self.begin_fp_context();
         }
-        let active = next.and_then(|next| self.reads_active_exception(next));
+        let missing = next.and_then(|next| self.reads_what_is_missing(next));
         let used = self.core.step();
-        if let Some((register, mask)) = active {
-            let value = self.core.reg(register) | u32::from(self.exception) & mask;
-            self.core.set_reg(register, value);
+        if let Some((register, bits)) = missing {
+            self.core.set_reg(register, self.core.reg(register) | bits);
         }
         self.account(used);
         used
@@ -410,8 +460,9 @@ impl Cpu {
         (!is_conditional || condition.passes(xpsr)).then(|| decode(first, second))
     }
 
-    /// The destination of a load from ICSR's low half, and the bits of VECTACTIVE that it has: `rsemu` leaves that field 0.
-    fn reads_active_exception(&self, instruction: Insn) -> Option<(u8, u32)> {
+    /// The destination of a load from ICSR or SYST_RVR, and the bits that `rsemu` leaves 0 there: VECTACTIVE, and a hidden
+    /// reload value.
+    fn reads_what_is_missing(&self, instruction: Insn) -> Option<(u8, u32)> {
         let Insn::LoadStore {
             load: true,
             size,
@@ -431,8 +482,17 @@ impl Cpu {
         } else {
             base.wrapping_sub(offset)
         };
-        (address == ICSR && self.is_default_handler)
-            .then_some((rt, if size == Size::Byte { 0xFF } else { 0x1FF }))
+        let bits = match address {
+            ICSR if self.is_default_handler => u32::from(self.exception),
+            SYST_RVR => self.hidden_reload,
+            _ => return None,
+        };
+        let mask = match size {
+            Size::Byte => 0xFF,
+            Size::Half => 0xFFFF,
+            Size::Word => u32::MAX,
+        };
+        Some((rt, bits & mask))
     }
 
     fn read(&self, address: u32) -> Option<u32> {
@@ -455,16 +515,18 @@ impl Cpu {
 
     /// Looks again at what may be taken and when SysTick will be.
     fn refresh(&mut self) {
-        let levels = self.levels_by_exception;
-        let (is_due, to_wrap, reset) = self.core.with_sys(|sys| {
+        let (levels, phase) = (self.levels_by_exception, self.systick_phase);
+        let (is_due, to_wrap, is_slow, reset) = self.core.with_sys(|sys| {
             (
                 is_any_due(sys, &levels),
-                cycles_to_wrap(sys),
+                cycles_to_wrap(sys, phase),
+                is_systick_slow(sys),
                 sys.reset_requested,
             )
         });
         self.is_exception_due = is_due;
         self.cycles_to_systick = to_wrap;
+        self.is_systick_slow = is_slow;
         self.reset_requested = reset;
     }
 
@@ -475,12 +537,8 @@ impl Cpu {
 
     /// Lets `cycles` pass without executing: SysTick and CYCCNT go on, and SysTick's exception is pended if it is due.
     pub fn skip(&mut self, cycles: u64) {
-        self.core.with_sys(|sys| {
-            sys.tick_cyccnt(cycles);
-            if sys.tick_systick(cycles) && sys.syst_csr & SYST_CSR_TICKINT != 0 {
-                sys.set_pending(Exception::SYSTICK, true);
-            }
-        });
+        self.core.with_sys(|sys| sys.tick_cyccnt(cycles));
+        self.count_systick(cycles);
         self.cycles += cycles;
         self.refresh();
     }
@@ -628,15 +686,26 @@ fn is_any_due(sys: &Sys, levels: &[u32; 4]) -> bool {
     })
 }
 
+/// Whether SysTick's clock is HCLK / 8; without a reload value it counts nothing.
+const fn is_systick_slow(sys: &Sys) -> bool {
+    sys.syst_csr & SYST_CSR_CLKSOURCE == 0 && sys.syst_rvr != 0
+}
+
 /// Cycles until SysTick's counter reaches 0 and pends the exception (DDI 0403E B3.3.1); `u64::MAX` if it will not.
-fn cycles_to_wrap(sys: &Sys) -> u64 {
+fn cycles_to_wrap(sys: &Sys, phase: u64) -> u64 {
     const RUNNING: u32 = 1 | SYST_CSR_TICKINT;
     if sys.syst_csr & RUNNING != RUNNING || sys.syst_rvr == 0 {
-        u64::MAX
-    } else if sys.syst_cvr == 0 {
+        return u64::MAX;
+    }
+    let counts = if sys.syst_cvr == 0 {
         u64::from(sys.syst_rvr) + 1
     } else {
         u64::from(sys.syst_cvr)
+    };
+    if is_systick_slow(sys) {
+        counts * SLOW_SYSTICK - phase
+    } else {
+        counts
     }
 }
 
@@ -761,6 +830,68 @@ mod tests {
         write_system(&cpu, SYST_CSR, 5);
         cpu.refresh();
         assert_eq!(cpu.cycles_to_systick(), None);
+    }
+
+    /// RM0090, clock tree: with CLKSOURCE clear SysTick counts HCLK / 8.
+    #[test]
+    fn systick_by_its_slow_clock_takes_eight_times_as_long() {
+        for skip_most in [false, true] {
+            let (mut cpu, _) = program(&[WFI, BACK], &[NOP, BX_LR], &[HERE]);
+            start_systick(&mut cpu, 99);
+            write_system(&cpu, SYST_CSR, 3);
+            cpu.refresh();
+            let mut interrupts = vec![];
+            while interrupts.len() < 5 {
+                if cpu.is_asleep() && !cpu.wake_pending() && skip_most {
+                    cpu.skip(cpu.cycles_to_systick().unwrap());
+                }
+                let before = cpu.current_exception();
+                cpu.step();
+                if before == 0 && cpu.current_exception() != 0 {
+                    interrupts.push(cpu.cycles());
+                }
+            }
+            for pair in interrupts.windows(2) {
+                assert_eq!(pair[1] - pair[0], 8 * 100, "skipping: {skip_most}");
+            }
+        }
+    }
+
+    #[test]
+    fn systick_by_its_slow_clock_reads_as_any_other() {
+        // r0 = SYST_CSR; r1 = RVR, r2 = CVR, r3 = CSR; RVR = r4.
+        let code = [
+            0x4803, 0x6841, 0x6882, 0x6803, 0x6044, HERE, NOP, NOP, 0xE010, 0xE000,
+        ];
+        let (mut cpu, _) = program(&code, &[HERE], &[HERE]);
+        start_systick(&mut cpu, 99);
+        write_system(&cpu, SYST_CSR, 1);
+        cpu.refresh();
+        // One count to load the reload value, three to 97, seven eighths of the next.
+        cpu.skip(8 * 3 + 7);
+        let mut registers = cpu.registers();
+        registers.r[4] = 0xFF_0007;
+        cpu.set_registers(registers);
+        for _ in 0..4 {
+            cpu.step();
+        }
+        let [_, rvr, cvr, csr, ..] = cpu.registers().r;
+        assert_eq!((rvr, cvr, csr), (99, 96, 1));
+        cpu.step();
+        let reload = cpu.core.with_sys(|sys| sys.read_word(SYST_CSR + 4, false));
+        assert_eq!(reload, Some(0xFF_0007));
+        // COUNTFLAG, once; the new reload value comes after the wrap.
+        cpu.skip(8 * 98);
+        let read = |register| cpu.core.with_sys(|sys| sys.read_word(register, false));
+        assert_eq!(read(SYST_CSR), Some(1 << 16 | 1));
+        assert_eq!(read(SYST_CSR), Some(1));
+        assert!((0xFF_0000..=0xFF_0007).contains(&read(SYST_CSR + 8).unwrap()));
+        // Back to the core's clock.
+        write_system(&cpu, SYST_CSR + 4, 99);
+        write_system(&cpu, SYST_CSR + 8, 0);
+        write_system(&cpu, SYST_CSR, 7);
+        cpu.refresh();
+        assert_eq!(cpu.cycles_to_systick(), Some(100));
     }
 
     #[test]
