@@ -17,9 +17,6 @@ const SLOW: Cell = Cell {
     ..AS_DESIGNED
 };
 
-/// The branch of [`SLOW`] as the model file has it.
-const BRANCH: &str = "[effects.polarisation]\nr1_ohm = 0.02\ntau1_s = 60\n";
-
 /// A log without its first rows: it begins under load.
 fn cut(cell: Cell, rows: usize, seed: u64) -> String {
     let whole = operation(cell, 0.9, 0.0005, 0, seed);
@@ -63,17 +60,26 @@ fn a_log_that_begins_under_load_is_explained() {
     }
 }
 
+/// Whether what is left at the start would be taken for a mismatch (20 mΩ) or for slips of the log (4 mΩ).
 #[test]
 fn with_its_branch_known_nothing_is_missing() {
-    for (rows, seed) in CUTS {
-        let text = format!("{}{BRANCH}", model(""));
-        let report = said(&text, &cut(SLOW, rows, seed), None);
-        let what = format!(
-            "{rows}, {seed}: {}; {}",
-            report["summary"],
-            remarks(&report)
-        );
-        assert_eq!(report["verdict"], "no-mismatch", "{what}");
+    for slow_ohm in [0.02, 0.004] {
+        let cell = Cell {
+            slow_ohm,
+            ..AS_DESIGNED
+        };
+        let branch = format!("[effects.polarisation]\nr1_ohm = {slow_ohm}\ntau1_s = 60\n");
+        for (rows, seed) in CUTS {
+            let text = format!("{}{branch}", model(""));
+            let report = said(&text, &cut(cell, rows, seed), None);
+            let what = format!(
+                "{rows}, {seed}: {}; {}",
+                report["summary"],
+                remarks(&report)
+            );
+            assert_eq!(report["verdict"], "no-mismatch", "{what}");
+            assert!(!remarks(&report).contains("slip"), "{what}");
+        }
     }
 }
 

@@ -236,7 +236,7 @@ impl Course<'_> {
         progress: &mut dyn FnMut(f64, &str),
     ) -> Answer {
         let mut answer = Answer::straight(self.decided(options, progress));
-        if self.problem.may_hold() {
+        if answer.decided.verdict != Verdict::NoMismatch && self.problem.may_hold() {
             let holds = Holds::ALL.map(Form::Holding);
             answer = self.answered_or(answer, &holds, options, progress);
         }
@@ -254,9 +254,8 @@ impl Course<'_> {
         options: &Options,
         progress: &mut dyn FnMut(f64, &str),
     ) -> Answer {
-        if answer.decided.verdict == Verdict::NoMismatch {
-            return answer;
-        }
+        let agrees = |decided: &Decided| decided.verdict == Verdict::NoMismatch;
+        let agreed = agrees(&answer.decided);
         let here = answer.other.as_ref().unwrap_or(self);
         let model = &answer.decided.selection.fit.model;
         let nearest = forms
@@ -270,12 +269,14 @@ impl Course<'_> {
         let Some((form, course, nearer)) = nearest else {
             return answer;
         };
-        if !answer.decided.names_nothing() && nearer <= form.asked_from() {
+        let is_open = answer.decided.names_nothing() && !agreed;
+        if !is_open && nearer <= form.asked_from() {
             return answer;
         }
         let (again, there) = course.decided(options, progress);
         let better = gained(&answer.shown, &there);
-        if better > CLEARLY {
+        // Where nothing was missing nothing is.
+        if better > CLEARLY && (!agreed || agrees(&again)) {
             let straight = answer
                 .between
                 .map_or_else(|| left(&answer.shown), |[straight, _]| straight);
