@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 
 use super::fit::{self, Fit};
+use super::slope;
 use super::unfitted::Unfitted;
 use super::workbench::{Member, Model, Workbench};
 use super::{Decided, Holdout, Options, decide, gained, lead_in, rms};
@@ -13,6 +14,11 @@ use crate::report::data::Verdict;
 /// The reference goes smoothly from row to row, or stays, if that makes the loss smaller by this (odds of e¹⁰, for no value more); where its
 /// rows alone tell so, unless it makes it larger by this.
 const CLEARLY: f64 = 10.0;
+
+/// What a battery remembers of before the recording has faded within this share of the recording's time, to …
+const FADES_WITHIN: f64 = 0.25;
+/// … where this share of its energy is.
+const FADED: f64 = 0.9;
 
 /// A signal with the files that were never fitted, as the reference goes from row to row.
 pub(super) struct Course<'a> {
@@ -44,6 +50,30 @@ impl Form {
             Self::Holding(_) => -CLEARLY,
             Self::OpenBegin => CLEARLY,
         }
+    }
+
+    /// Whether what was decided with it is what the form says: what a battery remembers of before fades, or it is a drift of the whole
+    /// recording, which has other reasons.
+    fn stands(self, course: &Course<'_>, decided: &Decided) -> bool {
+        if let Self::Holding(_) = self {
+            return true;
+        }
+        let bench = Workbench::new(&course.problem, &[]);
+        let with = &decided.selection.fit.model;
+        let mut without = with.clone();
+        without.nuisance.before_a = 0.0;
+        let remembered = slope::change(&bench.run(with), &bench.run(&without));
+        let end_s = |share: f64| {
+            bench
+                .t_s
+                .first()
+                .map(|from| from + share * bench.scale.span_s)
+        };
+        let early = bench
+            .t_s
+            .partition_point(|t| Some(*t) < end_s(FADES_WITHIN));
+        let energy = |rows: &[f64]| rows.iter().map(|v| v * v).sum::<f64>();
+        energy(&remembered[..early]) >= FADED * energy(&remembered)
     }
 
     /// What is held against a name that turns on it.
@@ -276,7 +306,8 @@ impl Course<'_> {
         let (again, there) = course.decided(options, progress);
         let better = gained(&answer.shown, &there);
         // Where nothing was missing nothing is.
-        if better > CLEARLY && (!agreed || agrees(&again)) {
+        let stands = (!agreed || agrees(&again)) && form.stands(&course, &again);
+        if better > CLEARLY && stands {
             let straight = answer
                 .between
                 .map_or_else(|| left(&answer.shown), |[straight, _]| straight);

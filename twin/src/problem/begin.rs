@@ -5,6 +5,8 @@
 
 use super::{AT_REST, Base, Problem, View};
 
+/// A first row is under load from this share of the largest current on.
+const LOADED: f64 = 0.02;
 /// Readings of a first rest that tell whether the voltage still moves there, at least.
 const FEWEST: usize = 10;
 /// It moves if the means of the two halves differ by so many standard uncertainties.
@@ -22,7 +24,9 @@ impl Problem {
             .iter()
             .take_while(|i| i.abs() <= AT_REST * largest);
         match rests.count() {
-            0 => !reference.is_empty(),
+            0 => reference
+                .first()
+                .is_some_and(|i| i.abs() >= LOADED * largest),
             rows => self.moves_until(self.drive.t_s[rows - 1]),
         }
     }
