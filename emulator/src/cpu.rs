@@ -549,7 +549,7 @@ impl Cpu {
     }
 
     /// The levels of IRQ 0 … 95, as RM0090 table 62 numbers them, and which of them have risen since the last call. An edge
-    /// pends its exception also while that is being served, and for good (DDI 0403E B3.4.1); a level as [`latch`] has it.
+    /// pends its exception also while that is being served, and for good (DDI 0403E B3.4.1); a level as `latch` has it.
     pub fn set_interrupts(&mut self, levels: [u32; 3], rose: [u32; 3]) {
         for irq in 0..LINES {
             let (word, bit) = (usize::from(irq / 32), 1 << (irq % 32));
