@@ -220,10 +220,17 @@ fn cycles() -> Vec<(usize, f64)> {
     [&[(600, 0.0)][..], &cycle.repeat(14)].concat()
 }
 
+/// The model file with the branch, from 95 % on, with a capacity stated.
+fn with_its_branch(stated_ah: f64) -> String {
+    let text = model()
+        .replace("initial_soc = 1.0", "initial_soc = 0.95")
+        .replace("capacity_ah = 30", &format!("capacity_ah = {stated_ah}"));
+    format!("{text}[effects.polarisation]\nr1_ohm = {SLOW_OHM}\ntau1_s = {SLOW_S}\n")
+}
+
 /// A rest that is logged more rarely than a load is the logger's: nothing is named for it, and what else is there is found with its size.
 #[test]
 fn what_a_log_of_uneven_rows_leaves_open_is_no_effect() {
-    let slow = format!("[effects.polarisation]\nr1_ohm = {SLOW_OHM}\ntau1_s = {SLOW_S}\n");
     let cell = cell(0.95, &cycles());
     for (logs, remark) in [(true, SINCE), (false, UNTIL)] {
         let log = |seed: u64| {
@@ -234,11 +241,9 @@ fn what_a_log_of_uneven_rows_leaves_open_is_no_effect() {
             }
         };
         for stated_ah in [CAPACITY_AH, 1.1 * CAPACITY_AH] {
-            let text = model()
-                .replace("initial_soc = 1.0", "initial_soc = 0.95")
-                .replace("capacity_ah = 30", &format!("capacity_ah = {stated_ah}"));
             let folder = tempfile::tempdir().unwrap();
-            let (report, left_v) = said(folder.path(), &format!("{text}{slow}"), &log(1), &log(2));
+            let (report, left_v) =
+                said(folder.path(), &with_its_branch(stated_ah), &log(1), &log(2));
             let case = format!("{remark}, {stated_ah} Ah: {}", report["summary"]);
             println!("{case}: {left_v} V");
             assert!(remarks(&report).contains(remark), "{case}");
@@ -292,13 +297,9 @@ fn an_uneven_log_of_ramps_stays_in_straight_lines() {
         }
         text
     };
-    let slow = format!("[effects.polarisation]\nr1_ohm = {SLOW_OHM}\ntau1_s = {SLOW_S}\n");
     for stated_ah in [CAPACITY_AH, 1.1 * CAPACITY_AH] {
-        let text = model()
-            .replace("initial_soc = 1.0", "initial_soc = 0.95")
-            .replace("capacity_ah = 30", &format!("capacity_ah = {stated_ah}"));
         let folder = tempfile::tempdir().unwrap();
-        let (report, left_v) = said(folder.path(), &format!("{text}{slow}"), &log(1), &log(2));
+        let (report, left_v) = said(folder.path(), &with_its_branch(stated_ah), &log(1), &log(2));
         let case = format!("{stated_ah} Ah: {}", report["summary"]);
         println!("{case}: {left_v} V");
         assert!(!remarks(&report).contains("each row's current"), "{case}");

@@ -306,8 +306,8 @@ impl Course<'_> {
         let (again, there) = course.decided(options, progress);
         let better = gained(&answer.shown, &there);
         // Where nothing was missing nothing is.
-        let stands = (!agreed || agrees(&again)) && form.stands(&course, &again);
-        if better > CLEARLY && stands {
+        let may_stand = better > CLEARLY && (!agreed || agrees(&again));
+        if may_stand && form.stands(&course, &again) {
             let straight = answer
                 .between
                 .map_or_else(|| left(&answer.shown), |[straight, _]| straight);

@@ -16,10 +16,8 @@ pub const BASE_OFF: f64 = 4.0;
 
 /// A small step of a bend, as a share of its uncertainty.
 const SMALL_BEND: f64 = 1e-3;
-/// The same of a current's zero.
-const SMALL_ZERO: f64 = 1e-3;
-/// The same of what flowed before the recording.
-const SMALL_BEFORE: f64 = 1e-3;
+/// The same of a current that is open.
+const SMALL_CURRENT: f64 = 1e-3;
 
 /// Whether a value of the base stands at that end, by how many of its standard uncertainties it is off.
 pub(super) fn at_base_end(deviations: f64) -> bool {
@@ -338,7 +336,7 @@ pub(super) fn coordinates(
         if let Some(sigma_a) = current_zero_sigma_a(bench, model) {
             all.push((
                 Coordinate::CurrentZero,
-                SMALL_ZERO * sigma_a,
+                SMALL_CURRENT * sigma_a,
                 inverse(sigma_a),
                 model.nuisance.current_zero_a,
             ));
@@ -346,7 +344,7 @@ pub(super) fn coordinates(
         if let Some(sigma_a) = before_sigma_a(bench) {
             all.push((
                 Coordinate::Before,
-                SMALL_BEFORE * sigma_a,
+                SMALL_CURRENT * sigma_a,
                 inverse(sigma_a),
                 model.nuisance.before_a,
             ));

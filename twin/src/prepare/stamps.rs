@@ -56,15 +56,15 @@ pub(super) fn spread(table: &mut Table, names: &[&str]) -> Option<String> {
             .map(|next| next[0] - run[0])
             .filter(|step| *step <= USUAL * usual_s)
             .unwrap_or(usual_s);
-        let missing = (usual - run.len() as f64).max(0.0);
         let is_first = index == 0;
-        let is_last = index + 1 == runs.len();
-        let all = if is_first || is_last {
-            run.len() as f64 + missing
+        // The rows that the recording began after, or ended before.
+        let cut_off = if is_first || index + 1 == runs.len() {
+            (usual - run.len() as f64).max(0.0)
         } else {
-            run.len() as f64
+            0.0
         };
-        let ahead = if is_first { missing } else { 0.0 };
+        let all = run.len() as f64 + cut_off;
+        let ahead = if is_first { cut_off } else { 0.0 };
         let begin_s = run[0];
         spread.extend((0..run.len()).map(|place| begin_s + (ahead + place as f64) / all * until_s));
     }

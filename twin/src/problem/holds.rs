@@ -84,9 +84,11 @@ impl Drive {
 impl Problem {
     /// Whether it matters for a battery how its current goes from row to row, and nothing tells: neither a counter nor the model file.
     pub fn may_hold(&self) -> bool {
-        let is_open = matches!(self.base, Base::Battery(_)) && self.drive.mean_share.is_none();
+        if !matches!(self.base, Base::Battery(_)) || self.drive.mean_share.is_some() {
+            return false;
+        }
         let (off, single) = self.drive.uneven();
-        is_open && off > ADDS_UP * single
+        off > ADDS_UP * single
     }
 
     /// The same with a reference that stays at one value between its rows; as it is where a counter or the model file tells.
