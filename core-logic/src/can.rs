@@ -32,7 +32,7 @@ pub const PROTOCOL_VERSION: u8 = 1;
 pub struct Frame {
     /// 11-bit identifier.
     pub id: u16,
-    /// Number of data bytes used.
+    /// Length code: the number of data bytes, or 9 … 15 as it was received, which stand for eight (ISO 11898-1).
     pub dlc: u8,
     /// Data.
     pub data: Payload,
@@ -680,7 +680,10 @@ impl core::fmt::Display for ReceiveError {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             Self::UnknownId(id) => write!(f, "message {id:#05x} is not received here"),
-            Self::Length { id, dlc } => write!(f, "message {id:#05x} has {dlc} bytes instead of 8"),
+            Self::Length { id, dlc } => write!(
+                f,
+                "message {id:#05x} has the length code {dlc} instead of 8"
+            ),
             Self::EndToEnd { id, error } => {
                 write!(f, "message {id:#05x} fails its end-to-end check: {error:?}")
             }
@@ -777,9 +780,9 @@ impl Receiver {
     pub fn on_frame(&mut self, now: Instant, frame: &Frame) -> Result<Received, ReceiveError> {
         let result = self.judge(now, frame);
         match result {
-            Ok(_) => self.accepted = self.accepted.wrapping_add(1),
+            Ok(_) => self.accepted = self.accepted.saturating_add(1),
             Err(ReceiveError::UnknownId(_)) => {}
-            Err(_) => self.refused = self.refused.wrapping_add(1),
+            Err(_) => self.refused = self.refused.saturating_add(1),
         }
         result
     }
@@ -799,7 +802,7 @@ impl Receiver {
         let lost = receiver
             .check(config, now, &frame.data)
             .map_err(|error| ReceiveError::EndToEnd { id, error })?;
-        self.lost = self.lost.wrapping_add(u32::from(lost));
+        self.lost = self.lost.saturating_add(u32::from(lost));
         if id == BATTERY {
             let content = battery_voltage(frame.data)?;
             self.battery_voltage = Some((now, content));
@@ -826,19 +829,19 @@ impl Receiver {
             .map(|(_, content)| content)
     }
 
-    /// Frames accepted, wrapping.
+    /// Frames accepted; stops at its end.
     #[must_use]
     pub const fn accepted(&self) -> u32 {
         self.accepted
     }
 
-    /// Frames refused, wrapping.
+    /// Frames refused; stops at its end.
     #[must_use]
     pub const fn refused(&self) -> u32 {
         self.refused
     }
 
-    /// Frames that were missing before an accepted one, wrapping.
+    /// Frames that were missing before an accepted one; stops at its end.
     #[must_use]
     pub const fn lost(&self) -> u32 {
         self.lost
@@ -1606,7 +1609,10 @@ mod tests {
         };
         let error = refuse(&mut receiver, short);
         assert_eq!(error, ReceiveError::Length { id: 0x202, dlc: 7 });
-        assert_eq!(error.to_string(), "message 0x202 has 7 bytes instead of 8");
+        assert_eq!(
+            error.to_string(),
+            "message 0x202 has the length code 7 instead of 8"
+        );
         let mut broken = vehicle(1, 1, 0);
         broken.data[2] ^= 1;
         let error = refuse(&mut receiver, broken);
@@ -1841,7 +1847,7 @@ mod tests {
         }
 
         #[test]
-        fn any_frame_is_judged_without_a_panic(id in 0x200u16..0x204, dlc in 0u8..=8, data: [u8; 8], now: u64) {
+        fn any_frame_is_judged_without_a_panic(id in 0x200u16..0x204, dlc in 0u8..=15, data: [u8; 8], now: u64) {
             let mut receiver = Receiver::default();
             let now = Instant::from_ticks(now);
             let accepted = receiver.on_frame(now, &Frame { id, dlc, data }).is_ok();

@@ -2,6 +2,7 @@
 
 use core_logic::range::Range;
 use emulator::can_bus::node::ErrorState;
+use emulator::can_frame::CanFrame;
 use emulator::rig::{Rig, with_crc};
 use emulator::rs485_line::Outgoing;
 use emulator::time::Ticks;
@@ -111,6 +112,58 @@ fn fault_f16_after_bus_off_the_newest_frames_come_back_and_measuring_went_on() {
     );
     assert!(back_s <= 0.03, "{back_s}");
     assert!(error_c.abs() <= quantum_c(Range::Small), "{error_c}");
+}
+
+/// ISO 11898-1: 9 … 15 stand for eight bytes, and the controller shows them as they are.
+#[test]
+fn fault_f17_a_length_code_above_eight_is_refused_and_counted() {
+    let mut rig = pulse(0.0, 2.0);
+    let refused = |rig: &mut Rig<'_>| counters(rig, 0x0126, 1)[0];
+    let before = refused(&mut rig);
+    let mut sent = 0;
+    for id in [0x201, 0x202] {
+        for length in 9..=15 {
+            rig.send_can(CanFrame {
+                length,
+                ..CanFrame::standard(id, &[0x55; 8])
+            });
+            sent += 1;
+            rig.run_s(0.01).unwrap();
+        }
+    }
+    assert_eq!(resets(&rig), 0);
+    assert_eq!(refused(&mut rig) - before, sent);
+    rig.run_s(0.5).unwrap();
+    assert!(rig.view.current_a().valid().is_some());
+}
+
+/// What waits in the mailbox and loses against a flood must not keep the current waiting, which wins.
+#[test]
+fn fault_f17_a_flood_above_all_but_the_current_delays_no_current() {
+    let mut rig = pulse(53.3, 3.0);
+    rig.run_s(0.5).unwrap();
+    let now = rig.machine.now();
+    let frames = vec![CanFrame::standard(0x120, &[0x55; 8])];
+    rig.machine
+        .can(|can| can.flood(frames, now, now + Ticks::from_millis(2_000)));
+    rig.view.restart_periods();
+    let state = rig.view.last_at("BoardState");
+    rig.run_s(2.0).unwrap();
+    let longest_s = rig.view.period("Current").longest_s;
+    println!(
+        "F17 flood of 0x120: Current at most {:.2} ms apart",
+        longest_s * 1e3
+    );
+    assert_eq!(
+        rig.view.last_at("BoardState"),
+        state,
+        "the flood starves it"
+    );
+    assert!(longest_s < 0.0125, "{longest_s}");
+    // What was starved comes back.
+    rig.run_s(1.0).unwrap();
+    assert!(rig.view.last_at("BoardState") > state);
+    assert_eq!(resets(&rig), 0);
 }
 
 #[test]
