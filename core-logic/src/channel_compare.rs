@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 use crate::design_parameters::LARGE_FULL_SCALE;
 use crate::error_budget;
 use crate::front_end::PerRange;
-use crate::meter::MeterReport;
+use crate::meter::{MeterReport, energy_difference};
 use crate::range::Range;
 use crate::units::{
     self, Duration, Instant, Microamps, Nanocoulombs, Ppm, add_i64, clamp_i32, elapsed,
@@ -197,6 +197,7 @@ struct Window {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 struct Count {
     at: Instant,
+    energy: i32,
     charge: Nanocoulombs,
     /// [`ChannelCompare::flowed`] at the report before, up to which it has counted: what came later may be missing. Moves on with
     /// what is declared.
@@ -396,7 +397,9 @@ impl ChannelCompare {
         }
         let point = MeterPoint::new(at, report);
         match self.moved {
-            Some(count) if count.charge == report.charge_total => self.check_frozen(config, at),
+            Some(count) if energy_difference(report.energy, count.energy) == 0 => {
+                self.check_frozen(config, at, report.charge_total);
+            }
             before => {
                 if let Some(count) = before.filter(|_| self.report.frozen) {
                     self.ended = Some((count.before, at));
@@ -405,6 +408,7 @@ impl ChannelCompare {
                 }
                 self.moved = Some(Count {
                     at,
+                    energy: report.energy,
                     charge: report.charge_total,
                     before: self.reported.0,
                     converter: None,
@@ -540,9 +544,10 @@ impl ChannelCompare {
         }
     }
 
-    /// AENERGY stands still at `at` although the converter's charge since its last count exceeds twice what the channels
-    /// may differ by. Only conversions that have ended by then: the rest may be counted, and not be read yet.
-    fn check_frozen(&mut self, config: &CompareConfig, at: Instant) {
+    /// AENERGY stands still at `at` although the converter's charge since its last count, less what the meter books for its
+    /// offsets alone, exceeds twice what the channels may differ by. Only conversions that have ended by then: the rest may be
+    /// counted, and not be read yet.
+    fn check_frozen(&mut self, config: &CompareConfig, at: Instant, booked: Nanocoulombs) {
         let (Some(count), Some((last, _)), Some(fast)) = (&self.moved, &self.last, &self.fast)
         else {
             return;
@@ -551,11 +556,20 @@ impl ChannelCompare {
             return;
         };
         let since = self.integral.since(&then);
+        if !elapsed_at_least(since.covered, config.short_gap_ms) {
+            return;
+        }
+        // Over the time that the conversions cover.
+        let offsets = mul_div(
+            booked.get().wrapping_sub(count.charge.get()),
+            (since.covered / 1_000).cast_signed(),
+            elapsed(count.at, at).as_millis().cast_signed().max(1),
+        );
         let counts = mul_i64(fast.meter.resolution.get(), FROZEN_COUNTS);
         let once = Nanocoulombs(add_i64(since.doubt, counts));
         let bound = once.saturating_add(once);
-        let charge = Nanocoulombs(since.charge).saturating_abs();
-        if elapsed_at_least(since.covered, config.short_gap_ms) && charge > bound {
+        let charge = Nanocoulombs(since.charge.wrapping_sub(offsets)).saturating_abs();
+        if charge > bound {
             self.report.frozen = true;
         }
     }
@@ -705,6 +719,7 @@ mod tests {
             let count = self.resolution().get();
             MeterReport {
                 at: Some(at(self.now)),
+                energy: self.charge.div_euclid(count) as i32,
                 charge_total: Nanocoulombs(self.charge.div_euclid(count) * count),
                 uncertainty: Nanocoulombs(self.uncertainty),
                 resolution: self.resolution(),
@@ -1153,6 +1168,7 @@ mod tests {
                 });
                 let _ = compare.on_meter(&config, &MeterReport {
                     at: flags[2].then_some(at(times[2])),
+                    energy: if flags[0] { current } else { 0 },
                     charge_total: Nanocoulombs(charges[0]),
                     uncertainty: Nanocoulombs(charges[1]),
                     resolution: Nanocoulombs(charges[2]),

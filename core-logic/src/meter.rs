@@ -266,6 +266,8 @@ pub enum ReadingOutcome {
 pub struct MeterReport {
     /// Time of the newest reading that was used; `None` before the first.
     pub at: Option<Instant>,
+    /// That reading's register: it moves by counts alone, the charge by what the offsets have counted as well.
+    pub energy: i32,
     /// Net charge; positive is discharged.
     pub charge_total: Nanocoulombs,
     /// Charge that went in, as a positive number.
@@ -304,6 +306,7 @@ impl Default for MeterReport {
     fn default() -> Self {
         Self {
             at: None,
+            energy: 0,
             charge_total: Nanocoulombs::ZERO,
             charge_in: Nanocoulombs::ZERO,
             charge_out: Nanocoulombs::ZERO,
@@ -810,6 +813,7 @@ impl MeterChannel {
         let magnitude = self.mean_current.saturating_abs();
         MeterReport {
             at: self.booked.last.map(|(reading, _)| reading.at),
+            energy: self.booked.last.map_or(0, |(reading, _)| reading.energy),
             charge_total: self.booked.total.rounded(),
             charge_in: self.booked.input.rounded(),
             charge_out: self.booked.output.rounded(),

@@ -100,6 +100,7 @@ impl Bench {
     fn count_ms(&mut self, milliseconds: u64) {
         for _ in 0..milliseconds / 10 {
             let charge = i64::from(self.report.mean_current.get()) * 10;
+            self.report.energy += i32::from(charge != 0);
             self.report.charge_total = self
                 .report
                 .charge_total

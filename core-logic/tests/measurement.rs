@@ -421,6 +421,32 @@ fn a_meter_that_stops_counting_is_found_within_a_second() {
     assert!(after <= 1.0, "{after} s");
 }
 
+/// What the meter books for its offset goes on while AENERGY stands still.
+#[test]
+fn a_meter_with_an_offset_that_stops_counting_is_found_all_the_same() {
+    let rows = rows(&[(0.0, 40.0), (30.0, 40.0)]);
+    for offset_ua in [1, -530_000, 2_000_000] {
+        let mut configuration = Configuration::default();
+        configuration.meter.offset.small = Microamps(offset_ua);
+        let mut board = HostBoard::new(&rows, Timing::default(), configuration);
+        assert!(board.run_until(|board| board.now_us > 13_000_000));
+        board.frozen = true;
+        let after = raised_within_s(board, Code::MeterFrozen).unwrap();
+        assert!(after <= 1.0, "{after} s with {offset_ua} µA");
+    }
+}
+
+/// The current that the offset takes off is 0 A at the meter, which counts nothing then and is not at fault.
+#[test]
+fn a_meter_whose_offset_hides_the_current_is_not_called_frozen() {
+    let rows = rows(&[(0.0, -5.0), (30.0, -5.0)]);
+    let mut configuration = Configuration::default();
+    configuration.meter.offset.small = Microamps(5_000_000);
+    let mut board = HostBoard::new(&rows, Timing::default(), configuration);
+    board.frozen = true;
+    assert_eq!(raised_within_s(board, Code::MeterFrozen), None);
+}
+
 #[test]
 fn a_converter_that_repeats_itself_is_found_by_the_meter_beside_it() {
     let rows = triangle();
