@@ -4,8 +4,9 @@
 //! **Integration.** The charge that remains, in nanocoulombs, follows the *differences* of the meter's signed counter.
 //! The counter itself never enters, so neither its sign nor its size can move the state of charge. What is charged
 //! counts with the coulombic efficiency; the fraction below a nanocoulomb is carried. A charging excursion bears the
-//! loss only past [`EFFICIENCY_BAND`]: a counter that flickers by a count at rest would otherwise lose charge with
-//! every flicker. Integration itself has no dead band.
+//! loss only past [`EXCURSION`]: a counter that flickers by a count at rest would otherwise lose charge with
+//! every flicker. For the same reason what is charged and what is discharged moves on by such excursions as a whole: what
+//! goes to and fro within one is in neither sum for good. Integration itself has no dead band.
 //!
 //! **0 and 100 %.** The charge that remains stops at 0 and at the capacity, and what exceeds them is added to
 //! [`SocReading::clipped`] (it says that capacity or offset are set wrong). So the first charge in the other direction
@@ -38,9 +39,9 @@ use crate::units::{
     mul_wide, sub_i64,
 };
 
-/// Charging excursions up to this bear no efficiency loss: 150 counts of the small range, 15 of the large one, and a
-/// part in 10⁶ of a common battery.
-pub const EFFICIENCY_BAND: Nanocoulombs = Nanocoulombs::from_coulombs(1);
+/// Excursions of the charge up to this bear no efficiency loss and add up to no throughput: 150 counts of the small range, 15 of
+/// the large one, and a part in 10⁶ of a common battery.
+pub const EXCURSION: Nanocoulombs = Nanocoulombs::from_coulombs(1);
 
 /// Capacities that the arithmetic is laid out for.
 pub const CAPACITY_LIMITS_MAH: (u32, u32) = (1, 2_000_000);
@@ -319,8 +320,10 @@ pub struct Soc {
     kept: SocRetained,
     last_total: Option<Nanocoulombs>,
     last_update: Option<Instant>,
-    /// Charging that may still happen without a loss, 0 … [`EFFICIENCY_BAND`].
+    /// Charging that may still happen without a loss, 0 … [`EXCURSION`].
     slack: i64,
+    /// What has flowed since charged and discharged were last moved, within [`EXCURSION`].
+    excursion: i64,
     clipped: i64,
     counter_jumps: u32,
     anchors: u32,
@@ -382,7 +385,8 @@ impl Soc {
             kept,
             last_total,
             last_update: None,
-            slack: EFFICIENCY_BAND.get(),
+            slack: EXCURSION.get(),
+            excursion: 0,
             clipped: 0,
             counter_jumps: 0,
             anchors: 0,
@@ -398,7 +402,13 @@ impl Soc {
     /// What must be saved; with it belongs the counter of the last update.
     #[must_use]
     pub const fn retained(&self) -> SocRetained {
-        self.kept
+        let mut kept = self.kept;
+        if self.excursion >= 0 {
+            kept.discharged.0 = add_i64(kept.discharged.get(), self.excursion);
+        } else {
+            kept.charged.0 = sub_i64(kept.charged.get(), self.excursion);
+        }
+        kept
     }
 
     /// Sets the state of charge, as a host does after service; presented at once.
@@ -478,6 +488,7 @@ impl Soc {
     /// The state of charge as others see it.
     #[must_use]
     pub fn reading(&self, coefficients: &SocCoefficients) -> SocReading {
+        let kept = self.retained();
         SocReading {
             presented: coefficients.share(Nanocoulombs(
                 self.kept.remaining.get() + self.kept.presented_offset.get(),
@@ -489,8 +500,8 @@ impl Soc {
             resting: self.rest_since.is_some(),
             anchors: self.anchors,
             clipped: Nanocoulombs(self.clipped),
-            charged: self.kept.charged,
-            discharged: self.kept.discharged,
+            charged: kept.charged,
+            discharged: kept.discharged,
             counter_jumps: self.counter_jumps,
         }
     }
@@ -516,16 +527,15 @@ impl Soc {
     /// Plain sums: a difference is at most 2⁶⁰ and a capacity below 2⁵³, see [`LARGEST_DIFFERENCE`].
     fn integrate(&mut self, coefficients: &SocCoefficients, delta: i64) {
         let mut remaining = self.kept.remaining.get() - delta;
-        if delta >= 0 {
-            self.kept.discharged.0 = self.kept.discharged.get().saturating_add(delta);
-            self.slack = (self.slack + delta).min(EFFICIENCY_BAND.get());
-        } else {
-            self.kept.charged.0 = sub_i64(self.kept.charged.get(), delta);
-            self.slack += delta;
-            if self.slack < 0 {
-                remaining -= self.loss(coefficients, self.slack.unsigned_abs());
-                self.slack = 0;
-            }
+        self.excursion += delta;
+        if self.excursion.unsigned_abs() >= EXCURSION.get().unsigned_abs() {
+            self.kept = self.retained();
+            self.excursion = 0;
+        }
+        self.slack = (self.slack + delta).min(EXCURSION.get());
+        if self.slack < 0 {
+            remaining -= self.loss(coefficients, self.slack.unsigned_abs());
+            self.slack = 0;
         }
         let limited = remaining.clamp(0, coefficients.capacity);
         if limited != remaining {
@@ -872,7 +882,7 @@ mod tests {
         let config = SocConfig::default();
         assert_eq!(config.capacity_mah, 240_000);
         assert_eq!(config.no_load_threshold, Microamps(3_000));
-        assert_eq!(EFFICIENCY_BAND, Nanocoulombs(1_000_000_000));
+        assert_eq!(EXCURSION, Nanocoulombs(1_000_000_000));
         let coefficients = SocCoefficients::new(&config);
         assert_eq!(coefficients.capacity(), Nanocoulombs(864_000 * COULOMB));
         // 0.2 % in 2^-32, and 200 ppm of 864,000 C in a second is 172,800 nC in a microsecond.
@@ -942,6 +952,32 @@ mod tests {
         assert_eq!(bench.reading().remaining, Nanocoulombs(36 * COULOMB));
     }
 
+    /// A sensor's zero drift of 2.5 A that is taken off by the meter: at 0 A four of five polls count once, 12.9 mC more than the
+    /// drift, and every fifth does not.
+    #[test]
+    fn a_zero_drift_that_is_taken_off_is_no_throughput() {
+        let mut bench = Bench::new(&config(), 500_000, 0);
+        let before = bench.reading().uncertainty;
+        let mut net = 0;
+        for poll in 0..3_600 * 50 {
+            let delta = if net < 0 { 12_860_000 } else { -50_000_000 };
+            net += delta;
+            bench.step(20_000, delta);
+            let reading = bench.reading();
+            let flowed = reading.discharged.get() - reading.charged.get();
+            assert_eq!(flowed, net, "{poll}");
+            let throughput = reading.charged.saturating_add(reading.discharged);
+            assert!(throughput < EXCURSION, "{throughput:?} after {poll} polls");
+        }
+        // As an hour in which nothing was counted to and fro.
+        let mut still = Bench::new(&config(), 500_000, 0);
+        for _ in 0..3_600 * 50 {
+            still.step(20_000, 1);
+        }
+        let grown = |bench: &Bench| bench.reading().uncertainty.get() - before.get();
+        assert!(grown(&bench) <= grown(&still) + 1);
+    }
+
     #[test]
     fn charging_bears_the_loss_and_flicker_does_not() {
         let lossy = SocConfig {
@@ -955,6 +991,8 @@ mod tests {
             bench.step(10_000, 6_700_000);
         }
         assert_eq!(bench.reading().remaining, Nanocoulombs(18_000 * COULOMB));
+        assert_eq!(bench.reading().charged, Nanocoulombs::ZERO);
+        assert_eq!(bench.reading().discharged, Nanocoulombs::ZERO);
         // 101 C charged: 1 C in the band, 100 C with 1 % less.
         for _ in 0..101 {
             bench.step(10_000, -COULOMB);
@@ -1521,7 +1559,7 @@ mod tests {
                 bench.step(20_000, -charge);
             }
             let sum: i64 = charges.iter().sum();
-            let lossy = (sum - EFFICIENCY_BAND.get()).max(0);
+            let lossy = (sum - EXCURSION.get()).max(0);
             let loss = lossy as f64 * f64::from(1_000_000 - efficiency) / 1e6;
             let expected = sum as f64 - loss;
             let allowed = 1.001 + sum as f64 * 2f64.powi(-33);
