@@ -59,7 +59,7 @@ pub enum Contradiction {
     Temperature,
     /// The key calibration's longest delay does not leave time to settle and to take its samples at the converter's data rate.
     KeyCalibrationDelay,
-    /// The slow window of the channels' comparison is not longer than the fast one.
+    /// The slow window of the channels' comparison is not longer than the fast one, or that is shorter than two conversions.
     CompareWindows,
     /// A storm's window or hold-off is too short for its events.
     Storm,
@@ -277,7 +277,10 @@ impl Configuration {
             Some(Contradiction::Temperature)
         } else if !self.key_calibration_has_time() {
             Some(Contradiction::KeyCalibrationDelay)
-        } else if self.compare.fast_window_ms >= self.compare.slow_window_ms {
+        } else if self.compare.fast_window_ms >= self.compare.slow_window_ms
+            || milliseconds(self.compare.fast_window_ms).as_ticks()
+                < 2 * self.converter.period(self.front_end.channel()).as_ticks()
+        {
             Some(Contradiction::CompareWindows)
         } else if !self.edge_storm.is_valid() || !self.meter_line_storm.is_valid() {
             Some(Contradiction::Storm)
@@ -874,7 +877,7 @@ mod tests {
     #[test]
     fn each_contradiction_is_found() {
         type Change = fn(&mut Configuration);
-        let cases: [(Change, Contradiction); 11] = [
+        let cases: [(Change, Contradiction); 12] = [
             (
                 |c| c.converter.gain = crate::converter::Gain::X2,
                 Contradiction::Converter(crate::converter::ConverterConfigError::Gain),
@@ -908,6 +911,15 @@ mod tests {
             ),
             (
                 |c| c.compare.fast_window_ms = c.compare.slow_window_ms,
+                Contradiction::CompareWindows,
+            ),
+            (
+                // Two conversions of 125 ms: what is compared waits for the one that spans it.
+                |c| {
+                    c.key_calibration.enabled = false;
+                    c.converter.data_rate = crate::converter::DataRate::Sps8;
+                    c.compare.fast_window_ms = 249;
+                },
                 Contradiction::CompareWindows,
             ),
             (|c| c.edge_storm.events = 21, Contradiction::Storm),
