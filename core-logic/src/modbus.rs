@@ -181,7 +181,7 @@ impl Command {
             | Self::ClearLog => CommandRule::Idle,
             Self::SupplyPointAtZero | Self::SupplyPointAtCurrent => CommandRule::SupplySweep,
             Self::FinishSupplyCalibration => CommandRule::SupplySweepBegun,
-            Self::Save => CommandRule::FlashFree,
+            Self::Save => CommandRule::SaveFree,
             Self::Abort | Self::ClearDiagnoses => CommandRule::Always,
         }
     }
@@ -198,8 +198,9 @@ pub enum CommandRule {
     SupplySweep,
     /// High voltage off, the supply sweep under way, flash not busy.
     SupplySweepBegun,
-    /// Flash not busy.
-    FlashFree,
+    /// No zero run under way, whose end would be taken for this order's; flash not busy. Another calibration waits for what
+    /// may never come, and must not keep a client from saving.
+    SaveFree,
 }
 
 impl CommandRule {
@@ -213,14 +214,17 @@ impl CommandRule {
             Self::SupplySweepBegun => {
                 "high voltage off, supply calibration under way, flash not busy"
             }
-            Self::FlashFree => "flash not busy",
+            Self::SaveFree => "no zero run under way, flash not busy",
         }
     }
 
     fn check(self, readings: &Readings) -> Result<(), Exception> {
         match self {
             Self::Always => return Ok(()),
-            Self::FlashFree => {}
+            Self::SaveFree if readings.activity == Activity::ZeroDrift => {
+                return Err(Exception::ServerDeviceBusy);
+            }
+            Self::SaveFree => {}
             Self::Idle => When::Standstill.check(readings)?,
             Self::SupplySweep | Self::SupplySweepBegun => {
                 let must_be_begun = self == Self::SupplySweepBegun;
@@ -1102,7 +1106,9 @@ mod tests {
             (C::Abort, quiet, 0),
             (C::Abort, (true, A::KeyCalibration, true), 0),
             (C::Save, (true, A::None, false), 0),
-            (C::Save, (false, A::ZeroDrift, false), 0),
+            (C::Save, (false, A::ZeroDrift, false), 6),
+            (C::Save, (false, A::KeyCalibration, false), 0),
+            (C::Save, (false, A::SupplyCalibration, false), 0),
             (C::Save, (false, A::None, true), 6),
             (C::Restore, quiet, 0),
             (C::Restore, (true, A::None, false), 4),
@@ -1149,7 +1155,7 @@ mod tests {
             board_text(C::FinishSupplyCalibration),
             "high voltage off, supply calibration under way, flash not busy"
         );
-        assert_eq!(board_text(C::Save), "flash not busy");
+        assert_eq!(board_text(C::Save), "no zero run under way, flash not busy");
         assert_eq!(board_text(C::Abort), "always");
     }
 

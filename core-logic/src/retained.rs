@@ -147,7 +147,7 @@ pub struct LogRecord {
     pub charge_validity: Validity,
     /// Causes against the state of charge.
     pub soc_validity: Validity,
-    /// Active diagnoses, one bit each in the order of the diagnosis table.
+    /// Diagnoses that are active or latched, one bit each in the order of the diagnosis table.
     pub diagnoses: u64,
     /// Supply of the sensor.
     pub supply: Millivolts,

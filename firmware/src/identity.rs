@@ -11,7 +11,10 @@ use core_logic::{
 };
 use stm32f4xx_hal::signature::Uid;
 
-use crate::retain::{Previous, ResetCause};
+use crate::{
+    retain::{Previous, ResetCause},
+    stack,
+};
 
 /// From the last write of the retained slots to the first reading of the meter after a reset: 100 ms between writes,
 /// 450 ms for the flash, 30 ms for the start.
@@ -35,7 +38,8 @@ pub fn identity(previous: &Previous) -> Identity {
         late_tasks: previous.late_tasks,
         unique_id: unique_id(),
         uptime: Duration::from_ticks(0),
-        stack_free: 0,
+        // Until it is looked at for the first time.
+        stack_free: stack::BYTES as u32,
         log_fill: None,
     }
 }

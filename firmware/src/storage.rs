@@ -354,8 +354,13 @@ impl Storage {
     }
 
     /// Erases the log's next sector that was written, 45 ms, at most 400 ms; whether there may be another one. All of
-    /// them in one go would take 23 s and more, in which no charge is saved.
+    /// them in one go would take 23 s and more, in which no charge is saved. An error if one could not be erased, or the
+    /// chip has not answered: what is read then looks blank.
     pub async fn clear_log_sector(&mut self, pace: Pace<'_>) -> Result<bool, ()> {
+        if !self.ready {
+            self.failed = true;
+            return Err(());
+        }
         // On from the last one, for a worn sector may never look blank.
         let from = core::mem::replace(&mut self.cleared, LOG.start);
         let end = LOG.end.min(from + LOOKED_AT);

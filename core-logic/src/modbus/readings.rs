@@ -321,8 +321,8 @@ inputs! {
 
     // Charge.
     0x0060 I64 1 "charge" "mC" "net, positive is discharge (1 mC = 1 mA·s)" |r, _| mc(r.charge);
-    0x0064 I64 1 "charge in" "mC" "charged since the start; `charge` goes on over it" |r, _| mc(r.charge_in);
-    0x0068 I64 1 "charge out" "mC" "discharged since the start" |r, _| mc(r.charge_out);
+    0x0064 I64 1 "charge in" "mC" "charged since the start, by the sign of each reading; `charge` goes on over it" |r, _| mc(r.charge_in);
+    0x0068 I64 1 "charge out" "mC" "discharged since the start, likewise: around 0 A both grow, as an offset and a count take turns" |r, _| mc(r.charge_out);
     0x006C I64 1 "charge uncertainty" "mC" "bound on what the last start, hand-overs and bridged gaps may have cost" |r, _| mc(r.charge_uncertainty);
     0x0070 I64 1 "channel difference" "mC" "meter less converter over the last slow window; 0 if that was undecided" |r, _| mc(r.channel_difference);
     0x0074 I64 1 "channel bound" "mC" "what they may differ by" |r, _| mc(r.channel_bound);

@@ -72,8 +72,9 @@ fn fault_f25_a_zero_at_the_wrong_time_is_refused_and_the_old_one_stays() {
     command(&mut rig, 1).unwrap();
     rig.run_s(1.0).unwrap();
     assert_eq!(state(&mut rig).0, 1);
-    // A second one meanwhile.
+    // A second one meanwhile, and what would take its state over: one of the two ends could not be told.
     assert_eq!(command(&mut rig, 1), Err(6));
+    assert_eq!(command(&mut rig, 7), Err(6));
     rig.power_cycle();
     rig.run_s(1.5).unwrap();
     assert_eq!(zero_drift(&mut rig), 123_000);

@@ -725,6 +725,12 @@ fn fault_f20_a_flash_that_comes_too_late_for_the_start_is_used_all_the_same() {
     let mut rig = boot_late(2.5);
     rig.run_s(1.0).unwrap();
     assert!(was_raised(&rig, "ConfigurationDefault"));
+    // What is read of a chip that does not answer looks blank: nothing was cleared.
+    command(&mut rig, 10).unwrap();
+    until(&mut rig, "an end of clear log", 0.3, |rig| {
+        input_registers(rig, 0x0023, 1)[0] >= 2
+    });
+    assert_eq!(input_registers(&mut rig, 0x0023, 1), [3]);
     // As long as it is missing, and not longer.
     let mut seen = 0;
     watch(&mut rig, 1.0, |rig| {
