@@ -13,7 +13,7 @@ use std::{
 };
 
 use recording::{csv, error::number, name};
-use serde::Deserialize;
+use serde::{Deserialize, Deserializer, de::IntoDeserializer};
 
 pub use extended::{Found, Shift};
 use place::Places;
@@ -46,6 +46,19 @@ pub enum FrontEndKind {
     ClosedLoop,
 }
 
+/// A word of a fixed list. What is no text is named as what it is; of an enumeration alone serde asks for a "string or table".
+fn word<'de, D: Deserializer<'de>, T: Deserialize<'de>>(deserializer: D) -> Result<T, D::Error> {
+    T::deserialize(String::deserialize(deserializer)?.into_deserializer())
+}
+
+fn some_word<'de, D, T>(deserializer: D) -> Result<Option<T>, D::Error>
+where
+    D: Deserializer<'de>,
+    T: Deserialize<'de>,
+{
+    word(deserializer).map(Some)
+}
+
 /// Accuracy of an instrument: `zero + gain·abs(reading)`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -63,6 +76,7 @@ pub struct AccuracySpec {
 #[serde(deny_unknown_fields, default)]
 pub struct Sensor {
     /// What stands between reference and reading.
+    #[serde(deserialize_with = "word")]
     pub front_end: FrontEndKind,
     /// Column of the reference; `i_ref_a` or `p_ref_w` if not stated.
     pub reference: Option<String>,
@@ -190,6 +204,7 @@ struct BatteryText {
     #[serde(default = "one_cell")]
     cells: u32,
     current: Option<String>,
+    #[serde(default, deserialize_with = "some_word")]
     current_holds: Option<Holds>,
     #[serde(default)]
     current_zero_a: f64,

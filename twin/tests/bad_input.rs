@@ -433,6 +433,33 @@ fn an_unknown_key() {
 }
 
 #[test]
+fn what_is_no_word_where_one_of_a_list_is_needed() {
+    for (model, key, words) in [
+        (
+            "[sensor]\nfront_end = 1",
+            "front_end",
+            ["pair", "dual-range"],
+        ),
+        (
+            "[battery]\ncurrent_holds = 1",
+            "current_holds",
+            ["since-last-row", "until-next-row"],
+        ),
+    ] {
+        let model = |value: &str| format!("schema = 1\n{}", model.replace('1', value));
+        for (value, found) in [("1", "integer `1`"), ("true", "boolean `true`")] {
+            says(
+                &explained(&model(value), &good()),
+                &["m.toml", "line 3", key, found, "string"],
+            );
+        }
+        let unknown = explained(&model("\"hold\""), &good());
+        says(&unknown, &["m.toml", "line 3", key, "`hold`"]);
+        says(&unknown, &words);
+    }
+}
+
+#[test]
 fn a_missing_column() {
     let recording = good().replacen("i_meas_a", "board", 1);
     says(
