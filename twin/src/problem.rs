@@ -139,6 +139,18 @@ impl Stretches {
         self.starts[after - 1].1
     }
 
+    /// The rows of a segment, which none may be. Segments ascend with the rows.
+    pub fn of(&self, segment: usize) -> Range<usize> {
+        let at = self.starts.partition_point(|(_, of)| *of < segment);
+        match self.starts.get(at) {
+            Some((first, of)) if *of == segment => {
+                let next = self.starts.get(at + 1);
+                *first..next.map_or(self.rows, |(next, _)| *next)
+            }
+            _ => 0..0,
+        }
+    }
+
     /// Each stretch: the index of its segment, and its rows.
     pub fn iter(&self) -> impl Iterator<Item = (usize, Range<usize>)> + '_ {
         let ends = self.starts.iter().skip(1).map(|(first, _)| *first);

@@ -266,10 +266,17 @@ fn line_sigma_a(drive: &Drive, segment: usize) -> f64 {
     let mean_a = 0.5 * (drive.reference[after - 1] + drive.reference[after]);
     let near_s = 2.0 * from_s - to_s..=2.0 * to_s - from_s;
     let (mut squares, mut time_s) = (0.0, 0.0);
-    let numbers = drive.operation_numbers();
-    let of_same = |index: &usize| numbers[*index] == numbers[segment];
-    for index in (0..drive.segments.len()).filter(of_same) {
-        let rows = drive.segments[index].clone();
+    // Of the same operation, in which time goes on from segment to segment.
+    let (before, behind) = drive.segments.split_at(segment);
+    let reaching = before.iter().enumerate().rev().take_while(|(index, rows)| {
+        drive.is_continued(index + 1) && drive.t_s[rows.end - 1] >= *near_s.start()
+    });
+    let reached = behind.iter().enumerate().take_while(|(index, rows)| {
+        (*index == 0 || drive.is_continued(segment + index))
+            && drive.t_s[rows.start] <= *near_s.end()
+    });
+    let around = segment - reaching.count()..segment + reached.count();
+    for rows in drive.segments[around].iter().cloned() {
         let times = &drive.t_s[rows.clone()];
         let near = times.partition_point(|t| t < near_s.start())
             ..times.partition_point(|t| t <= near_s.end());
@@ -329,10 +336,7 @@ fn flowed(base: &BatteryBase, drive: &Drive, rows: Range<usize>) -> f64 {
 
 /// Rows of a segment that were read.
 fn read_rows(observed: &Observed, segment: usize) -> impl Iterator<Item = usize> + '_ {
-    let own = observed.stretches.iter();
-    let rows = own
-        .filter(move |(of, _)| *of == segment)
-        .flat_map(|(_, rows)| rows);
+    let rows = observed.stretches.of(segment);
     rows.filter(|row| observed.valid[*row] && observed.value[*row].is_finite())
 }
 
