@@ -11,9 +11,9 @@ pub struct CanFrame {
     pub extended: bool,
     /// A request without data.
     pub remote: bool,
-    /// 0 … 8.
+    /// The length code as it is on the wire, 0 … 15. One above 8 stands for eight bytes (ISO 11898-1).
     pub length: u8,
-    /// Of which the first `length` count.
+    /// Of which the first [`CanFrame::bytes`] count.
     pub data: [u8; 8],
 }
 

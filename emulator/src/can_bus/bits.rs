@@ -48,15 +48,11 @@ pub struct Bits {
 }
 
 impl Bits {
-    /// Encodes `frame`: of its identifier the 11 or 29 bits, of its data what its length says.
+    /// Encodes `frame`: of its identifier the 11 or 29 bits, its length code as it is, of its data what that says.
     pub fn new(mut frame: CanFrame) -> Self {
         frame.id &= if frame.extended { 0x1FFF_FFFF } else { 0x7FF };
-        frame.length = frame.length.min(8);
-        let used = if frame.remote {
-            0
-        } else {
-            usize::from(frame.length)
-        };
+        frame.length = frame.length.min(15);
+        let used = if frame.remote { 0 } else { frame.bytes().len() };
         frame.data[used..].fill(0);
         let mut bits = Self {
             frame,
@@ -289,7 +285,7 @@ impl Reception {
             id: self.id,
             extended: self.extended,
             remote: self.remote,
-            length: count as u8,
+            length: self.length,
             data,
         }
     }
@@ -384,7 +380,8 @@ mod tests {
     /// The unstuffed lengths of ISO 11898-1: 44 + 8 n and 64 + 8 n bits, without intermission.
     #[test]
     fn lengths_without_stuff_bits() {
-        for length in 0..=8_u8 {
+        // ISO 11898-1: a length code of 9 … 15 stands for eight bytes.
+        for length in 0..=15_u8 {
             for (extended, remote) in [(false, false), (true, false), (false, true), (true, true)] {
                 let bits = Bits::new(CanFrame {
                     id: 0x555,
@@ -393,7 +390,11 @@ mod tests {
                     length,
                     data: [0x55; 8],
                 });
-                let data = if remote { 0 } else { 8 * u32::from(length) };
+                let data = if remote {
+                    0
+                } else {
+                    8 * u32::from(length.min(8))
+                };
                 let head = if extended { 64 } else { 44 };
                 assert_eq!(
                     u32::from(bits.length()) - bits.stuff_bits(),
@@ -427,7 +428,7 @@ mod tests {
         let data = if frame.remote {
             0
         } else {
-            u32::from(frame.length)
+            u32::from(frame.length.min(8))
         };
         if frame.extended {
             80 + 10 * data
@@ -451,14 +452,18 @@ mod tests {
             any::<u32>(),
             any::<bool>(),
             any::<bool>(),
-            0..=8_u8,
+            0..=15_u8,
             prop_oneof![
                 any::<[u8; 8]>(),
                 prop::array::uniform8(prop_oneof![Just(0_u8), Just(0xFF), Just(0x3C), Just(0xC3)])
             ],
         )
             .prop_map(|(id, extended, remote, length, mut data)| {
-                let used = if remote { 0 } else { usize::from(length) };
+                let used = if remote {
+                    0
+                } else {
+                    usize::from(length.min(8))
+                };
                 data[used..].fill(0);
                 CanFrame {
                     id: id & if extended { 0x1FFF_FFFF } else { 0x7FF },

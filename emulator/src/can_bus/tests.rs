@@ -381,6 +381,38 @@ fn the_interrupt_is_in_time() {
     }
 }
 
+/// ISO 11898-1: a length code of 9 … 15 stands for eight bytes. RDTR shows the code as it came: ST's HAL makes 8 of it
+/// in software.
+#[test]
+fn a_length_code_above_8_is_eight_bytes() {
+    let mut mcu = Mcu::ready();
+    for length in 0..=15 {
+        for extended in [false, true] {
+            for remote in [false, true] {
+                let used = if remote {
+                    0
+                } else {
+                    usize::from(length).min(8)
+                };
+                let mut frame = CanFrame {
+                    id: 0x321,
+                    extended,
+                    remote,
+                    length,
+                    data: [0xA5, 1, 2, 3, 4, 5, 6, 0x5A],
+                };
+                mcu.bus.inject(frame, Ticks(mcu.now));
+                mcu.run_bits(200);
+                frame.data[used..].fill(0);
+                assert_eq!(mcu.receive(0), [(frame, 0)]);
+                assert_eq!(frame.bytes().len(), usize::from(length).min(8));
+                let log = mcu.bus.take_log();
+                assert_eq!(log[0].frame, frame);
+            }
+        }
+    }
+}
+
 #[test]
 fn mailboxes_go_by_identifier_or_by_request() {
     for (fifo_order, expected) in [

@@ -1,8 +1,8 @@
 //! CAN1's registers, mailboxes, FIFOs and filters (RM0090 §32). The protocol itself is a [`Node`]'s business, the wire
 //! that of [`crate::can_bus::CanBus`], which owns both and is the peripheral for the MCU's bus.
 //!
-//! Not modelled, and an error: time triggered mode (TTCM, TGT), a length code above 8, accesses narrower than a word,
-//! reading an empty FIFO. The time stamps are 0. CAN2 is not there; the filter banks that CAN2SB gives it are its own.
+//! Not modelled, and an error: time triggered mode (TTCM, TGT), a length code above 8 in a transmit mailbox, accesses
+//! narrower than a word, reading an empty FIFO. A received one is in RDTR as it came. The time stamps are 0. CAN2 is not there; the filter banks that CAN2SB gives it are its own.
 
 use crate::can_bus::bits::{Bits, arbitration_rank};
 use crate::can_bus::node::{ErrorState, Event, Node};

@@ -226,6 +226,14 @@ mod tests {
         let mut remote = CanFrame::standard(0x123, &[]);
         (remote.remote, remote.length) = (true, 4);
         assert_eq!(received(23.424242, &remote), "< rtr 123 23.424242 4 >");
+        // The protocol knows no length code above 8, which stands for eight bytes.
+        remote.length = 15;
+        assert_eq!(received(23.424242, &remote), "< rtr 123 23.424242 8 >");
+        remote.remote = false;
+        assert_eq!(
+            received(23.424242, &remote),
+            "< frame 123 23.424242 0000000000000000 >"
+        );
     }
 
     #[test]
