@@ -39,7 +39,7 @@ pub fn identity(previous: &Previous) -> Identity {
         unique_id: unique_id(),
         uptime: Duration::from_ticks(0),
         // Until it is looked at for the first time.
-        stack_free: stack::BYTES as u32,
+        stack_free: u32::try_from(stack::BYTES).unwrap_or(0),
         log_fill: None,
     }
 }
