@@ -155,6 +155,11 @@ pub struct Board {
     flag: bool,
     outputs: Outputs,
     levels: DrivenLevels,
+    /// When they were last worked out.
+    driven_at: Ticks,
+    /// The meter's IRQ line as the MCU last saw it, and how often it found it changed.
+    irq_seen: Option<bool>,
+    irq_edges: u64,
     truth: Truth,
     trace: Option<Trace>,
     meter_transaction: MeterTransaction,
@@ -236,6 +241,9 @@ impl Board {
             flag,
             outputs: Outputs::default(),
             levels: DrivenLevels::default(),
+            driven_at: Ticks(0),
+            irq_seen: None,
+            irq_edges: 0,
             truth: Truth::default(),
             trace: None,
             meter_transaction: MeterTransaction::default(),
@@ -254,6 +262,13 @@ impl Board {
         }
         if let Some(at) = self.line.next_event() {
             next = next.min(at);
+        }
+        for fault in [self.irq_fault, self.flag_fault] {
+            if let LineFault::Toggling { every } = fault {
+                // The first edge after what the lines show already.
+                let every = every.0.max(1);
+                next = next.min(Ticks((self.driven_at.0 / every + 1) * every));
+            }
         }
         next.min(self.vehicle.next_event())
     }
@@ -388,11 +403,13 @@ impl Board {
     }
 
     fn drive_levels(&mut self, now: Ticks) {
-        let flag = faulty(self.flag_fault, self.flag, now);
+        // A byte's end, worked out in seconds, may be a tick off: a line must not toggle back for it.
+        self.driven_at = self.driven_at.max(now);
+        let flag = faulty(self.flag_fault, self.flag, self.driven_at);
         self.levels.set(pins::RANGE_FLAG, Some(flag));
         self.levels.set(pins::RANGE_GATE, Some(flag));
         // Open drain: high is nobody's doing but the pull-up's.
-        let irq_high = faulty(self.irq_fault, !self.meter.irq_low(), now);
+        let irq_high = faulty(self.irq_fault, !self.meter.irq_low(), self.driven_at);
         self.levels
             .set(pins::METER_IRQ, (!irq_high).then_some(false));
         // Pull-ups on the bus: a line that nobody pulls is high.
@@ -441,6 +458,11 @@ impl Board {
     /// Edges that no snapshot has answered yet.
     pub fn unanswered_edges(&self) -> usize {
         self.unanswered.len()
+    }
+
+    /// Edges of the meter's IRQ line that have reached the MCU's pin, masked there or not.
+    pub const fn irq_edges(&self) -> u64 {
+        self.irq_edges
     }
 
     /// The surroundings now.
@@ -583,6 +605,52 @@ impl Outside for Board {
     }
 
     fn levels(&mut self, _at: Ticks) -> DrivenLevels {
+        let irq = self.levels.driven(pins::METER_IRQ);
+        self.irq_edges += u64::from(irq != self.irq_seen);
+        self.irq_seen = irq;
         self.levels
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use plant::ade7753::Ade7753Config;
+    use plant::ads1100::Ads1100Config;
+    use plant::w25q32::W25q32Config;
+
+    use super::*;
+    use crate::scenario::Contactors;
+
+    /// Each edge of a storm is an event of its own, whatever else happens or does not.
+    #[test]
+    fn a_storm_has_all_its_edges() {
+        for frequency_hz in [1e3, 25e3, 100e3, 1e6] {
+            let mut board = Board::new(
+                BoardConfig::default(),
+                Scenario::steady(Row::at_rest(0.0), Contactors::AlwaysClosed),
+                Ade7753::new(Ade7753Config::default(), 0.0),
+                Ads1100::new(Ads1100Config::default(), 0.0),
+                W25q32::with_content(W25q32Config::default(), 0.0, Vec::new()),
+            );
+            board.irq_fault = LineFault::Toggling {
+                every: Ticks::from_seconds(0.5 / frequency_hz),
+            };
+            loop {
+                let at = board.next_event();
+                if at > Ticks::from_millis(100) {
+                    break;
+                }
+                board.advance(at);
+                board.take_vehicle_frames(at);
+                board.levels(at);
+                assert!(board.next_event() > at, "time stands still at {at:?}");
+            }
+            let expected = 0.1 * 2.0 * frequency_hz;
+            let edges = board.irq_edges() as f64;
+            assert!(
+                (edges - expected).abs() <= 2.0,
+                "{frequency_hz} Hz: {edges} of {expected}"
+            );
+        }
     }
 }

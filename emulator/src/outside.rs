@@ -49,6 +49,12 @@ impl DrivenLevels {
         self.level[port] =
             (self.level[port] & !pin.bit()) | if level == Some(true) { pin.bit() } else { 0 };
     }
+
+    /// The level that the outside drives onto `pin`; `None` where it does not drive.
+    pub fn driven(&self, pin: Pin) -> Option<bool> {
+        let port = usize::from(pin.port);
+        (self.driven[port] & pin.bit() != 0).then_some(self.level[port] & pin.bit() != 0)
+    }
 }
 
 /// What the MCU drives as general-purpose outputs (alternate functions are not in here).

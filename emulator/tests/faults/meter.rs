@@ -386,25 +386,43 @@ fn fault_f07_a_crystal_off_or_stopped() {
 
 #[test]
 fn fault_f08_the_irq_line_stuck_or_storming_is_masked_and_polling_goes_on() {
-    for line in ["low", "high", "1kHz", "100kHz"] {
+    for (line, frequency_hz) in [
+        ("low", None),
+        ("high", None),
+        ("1kHz", Some(1e3)),
+        ("100kHz", Some(100e3)),
+    ] {
         let mut rig = pulse(50.0, 2.0);
         let before = charges_c(&mut rig);
         rig.run_s(0.3).unwrap();
         rig.machine.restart_load();
         rig.view.restart_periods();
+        let edges_before = board(&mut rig, |board| board.irq_edges());
         strike(&mut rig, &format!("F8:{line},1500ms"));
         rig.run_s(1.5).unwrap();
+        // At the pin: the firmware masks it.
+        let edges = board(&mut rig, |board| board.irq_edges()) - edges_before;
         let load = rig.machine.load().share();
         let longest_s = rig.view.period("Current").longest_s;
         let masked = was_raised(&rig, "EdgeStorm");
         rig.run_s(1.2).unwrap();
         let error_c = charge_error_c(&mut rig, before);
         println!(
-            "F8 {line}: load {:.1} %, current frames at most {:.2} ms apart, storm {masked}, error {:.1} mC",
+            "F8 {line}: {edges} edges, load {:.1} %, current frames at most {:.2} ms apart, storm {masked}, error {:.1} mC",
             load * 100.0,
             longest_s * 1e3,
             error_c * 1e3
         );
+        match frequency_hz {
+            Some(frequency_hz) => {
+                let struck = 2.0 * frequency_hz * 1.5;
+                assert!(
+                    (edges as f64 / struck - 1.0).abs() < 0.02,
+                    "{line}: {edges} of {struck}"
+                );
+            }
+            None => assert!(edges <= 2, "{line}: {edges}"),
+        }
         assert!(load < 0.5, "{line}: {load}");
         assert!(longest_s < 0.0125, "{line}: {longest_s}");
         // A line that stays low asks again and again.
