@@ -21,6 +21,7 @@ use crate::bus_view::BusView;
 use crate::calibration::Account;
 use crate::can_bus::LoggedFrame;
 use crate::can_frame::CanFrame;
+use crate::profile::SENSOR_RANGE_A;
 use crate::rig::{Firmware, Rig, Setup};
 use crate::rs485_line::{Direction, LogEntry};
 use crate::serve;
@@ -116,6 +117,10 @@ pub struct Figures {
     pub resets: Vec<Event>,
     /// What the chips' data sheets forbid and the firmware did all the same.
     pub violations: Vec<Breach>,
+    /// How often an input of the ADE7753 went beyond the range for which it is specified.
+    pub meter_over_range: u64,
+    /// The largest current of the drive, in A.
+    pub largest_a: f64,
 }
 
 /// A rule of a chip's data sheet that was broken.
@@ -366,6 +371,8 @@ impl<'firmware> Drive<'firmware> {
                 })
                 .collect(),
             violations,
+            meter_over_range: rig.machine.board(|board| board.meter.over_range()),
+            largest_a: flow.largest_a,
             calibration: None,
         }
     }
@@ -445,6 +452,7 @@ struct Flow {
     throughput_c: f64,
     squares_a2s: f64,
     below_no_load_s: f64,
+    largest_a: f64,
 }
 
 impl Flow {
@@ -452,6 +460,7 @@ impl Flow {
         let length_s = sample.t_s - self.last_s;
         self.last_s = sample.t_s;
         let current_a = sample.current_a;
+        self.largest_a = self.largest_a.max(current_a.abs());
         self.throughput_c += current_a.abs() * length_s;
         self.squares_a2s += current_a * current_a * length_s;
         // The budget's own threshold, in µA.
@@ -738,7 +747,19 @@ pub fn complaints(figures: &Figures) -> Vec<String> {
         )
     };
     complaints.extend(figures.violations.iter().map(breach));
+    // At the end of its range the current itself may be the reason.
+    if figures.meter_over_range > 0 && figures.largest_a < SENSOR_RANGE_A {
+        complaints.push(format!(
+            "ADE7753: an input {} at no more than {:.1} A",
+            over_range(figures.meter_over_range),
+            figures.largest_a
+        ));
+    }
     complaints
+}
+
+fn over_range(times: u64) -> String {
+    format!("beyond its range {times} times")
 }
 
 /// The figures as the terminal shows them.
@@ -819,6 +840,12 @@ pub fn summary(figures: &Figures) -> String {
             figures.frames
         ),
     );
+    if figures.meter_over_range > 0 {
+        line(
+            "ADE7753",
+            format!("an input {}", over_range(figures.meter_over_range)),
+        );
+    }
     let complaints = complaints(figures);
     line(
         "against it",
@@ -838,4 +865,28 @@ pub fn summary(figures: &Figures) -> String {
         ),
     );
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A sensor that the drive does not take to its end has no business beyond the meter's range; one at its end may.
+    #[test]
+    fn an_input_beyond_the_meters_range_is_shown_and_speaks_against_the_board() {
+        let good = complaints(&Figures::default()).len();
+        for (largest_a, meter_over_range, against) in
+            [(300.0, 0, 0), (300.0, 2, 1), (600.0, 2, 0), (600.0, 0, 0)]
+        {
+            let figures = Figures {
+                largest_a,
+                meter_over_range,
+                ..Figures::default()
+            };
+            let complaints = complaints(&figures);
+            assert_eq!(complaints.len(), good + against, "{complaints:?}");
+            let shown = summary(&figures).contains("beyond its range 2 times");
+            assert_eq!(shown, meter_over_range > 0);
+        }
+    }
 }

@@ -19,7 +19,6 @@ use crate::mcu::system_bus::{Failure, SystemBus};
 use crate::mcu::tim2::Tim2;
 use crate::mcu::usart::Usart;
 use crate::mcu::{Lines, Unmodelled, system_memory};
-use crate::outside::PORTS;
 use crate::rtt::{Log, Memory};
 use crate::time::Ticks;
 
@@ -305,11 +304,6 @@ impl<'table> Machine<'table> {
     /// Works on ADC1.
     pub fn adc<T>(&mut self, work: impl FnOnce(&mut Adc1) -> T) -> T {
         self.bus.with_adc(work)
-    }
-
-    /// Pins on which MCU and outside have driven against each other since the last call: a fault of the wiring.
-    pub fn take_conflicts(&mut self) -> [u16; PORTS] {
-        self.bus.take_conflicts()
     }
 
     /// Works on the crystal and the watchdog's clock.

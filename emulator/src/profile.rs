@@ -7,6 +7,9 @@ use recording::{Mapping, Recording};
 
 use crate::scenario::{Contactors, Key, Row};
 
+/// The end of the large sensor's range, in A.
+pub const SENSOR_RANGE_A: f64 = 600.0;
+
 /// What is taken of a recording, and how.
 #[derive(Clone, Debug)]
 pub struct ProfileOptions {
@@ -32,7 +35,7 @@ impl Default for ProfileOptions {
             duration_s: None,
             lead_s: 1.0,
             tail_s: 0.5,
-            limit_a: 600.0,
+            limit_a: SENSOR_RANGE_A,
         }
     }
 }

@@ -277,6 +277,24 @@ impl State {
         })
     }
 
+    /// Two outputs against each other: real ones would not last.
+    fn check_conflicts(&mut self) {
+        let conflicts = self.gpio.take_conflicts();
+        let Some(port) = conflicts.iter().position(|pins| *pins != 0) else {
+            return;
+        };
+        let letter = ["A", "B", "C"][port];
+        let number = conflicts[port].trailing_zeros();
+        self.failure.get_or_insert(Failure {
+            access: Unmodelled {
+                register: format!("GPIO{letter}_ODR"),
+                what: format!(
+                    "P{letter}{number} driven against the level that the board drives onto it"
+                ),
+            },
+        });
+    }
+
     /// The signals of an SPI master that sends have to reach their pins, and clock and data to be able to follow its clock: real pins would
     /// round the edges off. And the clock's pad has to be fast against the clock of the APB, however slow the SPI is: what is received is
     /// strobed by what comes back through that pad, and if it comes late the last bit is the one of the byte before (errata ES0182,
@@ -379,10 +397,11 @@ impl State {
         self.follow_levels(now);
     }
 
-    /// Pins that changed reach EXTI and the gate of TIM4.
+    /// Pins that changed reach EXTI and the gate of TIM4. One that is driven from both sides ends the run.
     fn follow_levels(&mut self, now: Ticks) {
         let driven = self.board.levels(now);
         let levels = self.gpio.input_levels(&driven);
+        self.check_conflicts();
         if levels != self.levels {
             self.exti
                 .on_levels(self.levels, levels, &self.syscfg, &self.interrupts);
@@ -613,11 +632,6 @@ impl SystemBus {
         let result = work(&mut state.tim2);
         self.publish(&state);
         result
-    }
-
-    /// Pins on which the MCU and the outside have driven against each other since the last call, as bits of each port.
-    pub fn take_conflicts(&self) -> [u16; PORTS] {
-        self.lock().gpio.take_conflicts()
     }
 
     /// Works on clocks and watchdog, for the faults that sit in the MCU's surroundings (crystal, LSI).
@@ -895,6 +909,34 @@ mod tests {
             }
             Ok(())
         }
+    }
+
+    /// PC6 is the key's line, which the board drives.
+    #[test]
+    fn driving_against_the_outside_ends_the_run() {
+        const GPIOC: u32 = 0x4002_0800;
+        let bus = bus();
+        let mut state = with_clocks(&bus);
+        let outside = state.board.levels(Ticks(0)).driven(pins::KEY).unwrap();
+        let level = |high: bool| u32::from(high) << 6;
+        state
+            .write(GPIOC + 0x14, 4, level(outside), Ticks(0))
+            .unwrap();
+        state.write(GPIOC, 4, 0b01 << 12, Ticks(0)).unwrap();
+        assert_eq!(state.failure, None);
+        state
+            .write(GPIOC + 0x14, 4, level(!outside), Ticks(0))
+            .unwrap();
+        let failure = state.failure.take().unwrap().access;
+        assert_eq!(failure.register, "GPIOC_ODR");
+        assert!(failure.what.contains("PC6"), "{failure}");
+        // A low of an open drain is what a pull-up outside looks like.
+        state
+            .write(GPIOC + 0x14, 4, level(outside), Ticks(0))
+            .unwrap();
+        state.write(GPIOC + 0x04, 4, 1 << 6, Ticks(0)).unwrap();
+        state.write(GPIOC + 0x14, 4, 0, Ticks(0)).unwrap();
+        assert_eq!(state.failure, None);
     }
 
     #[test]
