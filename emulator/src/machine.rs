@@ -49,7 +49,7 @@ pub enum MachineError {
         /// When, in s.
         at_s: f64,
     },
-    /// The core stopped executing: a fault where no handler can be taken.
+    /// The core stopped executing, a fault where no handler can be taken, and no watchdog runs that would reset it.
     LockedUp {
         /// Where.
         pc: u32,
@@ -394,7 +394,8 @@ impl<'table> Machine<'table> {
     /// Runs until `end`.
     ///
     /// # Errors
-    /// [`MachineError`] if the image touched something that is not modelled, or the core locked up and no watchdog ends it.
+    /// [`MachineError`] if the image touched something that is not modelled, or the core is locked up and no watchdog runs.
+    /// Where one runs, the log tells of it, and time passes until the reset.
     pub fn run_until(&mut self, end: Ticks) -> Result<(), MachineError> {
         while self.now < end {
             let mut next = self.bus.next_event();
@@ -419,16 +420,19 @@ impl<'table> Machine<'table> {
             if held {
                 stop = stop.min(self.held_until);
             }
+            if locked_up {
+                let (pc, at_s) = (self.cpu.pc(), self.now.seconds());
+                if !self.locked_up {
+                    self.locked_up = true;
+                    self.log_lines
+                        .push(format!("{at_s:.6} the core is locked up at {pc:#010X}"));
+                }
+                if !self.bus.with_clocks(|_, watchdog| watchdog.is_running()) {
+                    return Err(MachineError::LockedUp { pc, at_s });
+                }
+            }
             if idle || locked_up || held {
                 self.sleep_until(stop);
-                if locked_up && !self.locked_up {
-                    self.locked_up = true;
-                    self.log_lines.push(format!(
-                        "{:.6} the core is locked up at {:#010X}",
-                        self.now.seconds(),
-                        self.cpu.pc()
-                    ));
-                }
                 continue;
             }
             let per_cycle = self.bus.ticks_per_cycle();
@@ -514,5 +518,97 @@ impl<'table> Machine<'table> {
         let spent = Ticks(cycles * per_cycle);
         self.now += spent;
         self.load.asleep += spent;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
+    use std::path::PathBuf;
+
+    use plant::ade7753::{Ade7753, Ade7753Config};
+    use plant::ads1100::{Ads1100, Ads1100Config};
+    use plant::w25q32::{W25q32, W25q32Config};
+
+    use super::*;
+    use crate::board::BoardConfig;
+    use crate::scenario::{Contactors, Row, Scenario};
+
+    const START: u32 = FLASH_START + 0x200;
+    const HANDLER: u32 = FLASH_START + 0x240;
+    const UDF: u16 = 0xDE00;
+    /// `str r1, [r0]`
+    const STORE: u16 = 0x6001;
+
+    /// A board whose MCU loads `operands` into r0 and r1, goes on with `code`, and answers a fault by `handler`.
+    fn machine(operands: [u32; 2], code: [u16; 3], handler: u16) -> Machine<'static> {
+        let mut flash = vec![0xFF; FLASH_LENGTH as usize];
+        let mut put = |address: u32, halves: &[u16]| {
+            for (at, half) in (address - FLASH_START..).step_by(2).zip(halves) {
+                flash[at as usize..at as usize + 2].copy_from_slice(&half.to_le_bytes());
+            }
+        };
+        let word = |word: u32| [word as u16, (word >> 16) as u16];
+        let vectors = (SRAM_START + SRAM_LENGTH, START | 1);
+        put(FLASH_START, &word(vectors.0));
+        put(FLASH_START + 4, &word(vectors.1));
+        put(FLASH_START + 12, &word(HANDLER | 1));
+        // ldr r0, [pc, #8]; ldr r1, [pc, #12]
+        put(START, &[0x4802, 0x4903]);
+        put(START + 4, &code);
+        put(START + 12, &operands.map(word).concat());
+        put(HANDLER, &[handler]);
+        let image = Image {
+            path: PathBuf::new(),
+            elf: Vec::new(),
+            flash,
+            vectors,
+            rtt: None,
+        };
+        let board = Board::new(
+            BoardConfig::default(),
+            Scenario::steady(Row::at_rest(0.0), Contactors::AlwaysClosed),
+            Ade7753::new(Ade7753Config::default(), 0.0),
+            Ads1100::new(Ads1100Config::default(), 0.0),
+            W25q32::with_content(W25q32Config::default(), 0.0, Vec::new()),
+        );
+        Machine::new(&image, None, board).unwrap()
+    }
+
+    #[test]
+    fn a_locked_up_core_ends_the_run_where_no_watchdog_runs() {
+        let mut machine = machine([0; 2], [UDF; 3], UDF);
+        for _ in 0..2 {
+            // What the program counter reads as then (ARMv7-M, lockup).
+            let Err(MachineError::LockedUp {
+                pc: 0xFFFF_FFFE,
+                at_s,
+            }) = machine.run_until(Ticks::from_millis(10))
+            else {
+                panic!("at {:#010X}", machine.cpu().pc());
+            };
+            assert!(at_s < 1e-3, "{at_s}");
+        }
+        let log = machine.take_log();
+        assert_eq!(log.len(), 1, "{log:?}");
+        assert!(log[0].contains("locked up"), "{log:?}");
+        assert_eq!(machine.resets().len(), 1);
+    }
+
+    #[test]
+    fn a_locked_up_core_waits_for_the_watchdog() {
+        // IWDG_KR.
+        let mut machine = machine([0x4000_3000, 0xCCCC], [STORE, UDF, UDF], UDF);
+        machine.run_until(Ticks::from_millis(1_200)).unwrap();
+        let causes: Vec<ResetCause> = machine.resets().iter().map(|reset| reset.cause).collect();
+        // After reset 4096 steps of LSI / 4: 512 ms.
+        let watchdog = ResetCause::IndependentWatchdog;
+        assert_eq!(causes, [ResetCause::PowerOn, watchdog, watchdog]);
+        assert_eq!(
+            machine.take_log().len(),
+            3,
+            "it locks up after each of them"
+        );
     }
 }

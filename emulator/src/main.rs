@@ -144,7 +144,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 enum Failure {
     /// The check that was asked for failed.
     Check(String),
-    /// The image did what the model lacks, or locked up.
+    /// The image did what the model lacks, or locked up while no watchdog ran.
     Image(String),
     /// The input is not what it should be.
     Input(String),
