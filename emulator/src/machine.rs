@@ -3,7 +3,9 @@
 use std::fmt;
 use std::sync::Arc;
 
-use rsemu::core::space::{AddressSpace, DispatchPolicy, RamStore, Region, RomStore, RomWrite};
+use rsemu::core::space::{
+    AddressSpace, DispatchPolicy, Perms, RamStore, Region, RomStore, RomWrite,
+};
 
 use crate::board::Board;
 use crate::can_bus::CanBus;
@@ -197,19 +199,27 @@ impl<'table> Machine<'table> {
                 Region::ram("sram", Arc::clone(&memories.sram)),
                 u64::from(SRAM_START),
             )?;
-            map.map(
+            // On the D-bus alone: nothing can be fetched from it.
+            map.map_with_perms(
                 Region::ram("ccm", Arc::clone(&memories.ccm)),
                 u64::from(CCM_START),
+                Perms::RW,
             )?;
             map.map(
                 Region::rom("system memory", factory, RomWrite::Fault),
                 SYSTEM_MEMORY,
             )?;
-            map.map(
+            // Execute Never (ARMv7-M, default memory map). The fault is a BusFault (IBUSERR) here, on silicon a MemManage.
+            map.map_with_perms(
                 Region::io("peripherals", PERIPHERALS.1, Arc::<SystemBus>::clone(&bus)),
                 PERIPHERALS.0,
+                Perms::RW,
             )?;
-            map.map(Region::ram("dbgmcu", Arc::clone(&debug)), DEBUG.0)?;
+            map.map_with_perms(
+                Region::ram("dbgmcu", Arc::clone(&debug)),
+                DEBUG.0,
+                Perms::RW,
+            )?;
         }
         debug_assert_eq!(image.flash.len(), FLASH_LENGTH as usize);
         let cpu = Cpu::new(Arc::new(space));
@@ -538,8 +548,15 @@ mod tests {
     const START: u32 = FLASH_START + 0x200;
     const HANDLER: u32 = FLASH_START + 0x240;
     const UDF: u16 = 0xDE00;
+    const NOP: u16 = 0xBF00;
+    /// `b .`
+    const HERE: u16 = 0xE7FE;
     /// `str r1, [r0]`
     const STORE: u16 = 0x6001;
+    /// `adds r0, #1`
+    const TO_THUMB: u16 = 0x3001;
+    /// `bx r0`
+    const JUMP: u16 = 0x4700;
 
     /// A board whose MCU loads `operands` into r0 and r1, goes on with `code`, and answers a fault by `handler`.
     fn machine(operands: [u32; 2], code: [u16; 3], handler: u16) -> Machine<'static> {
@@ -610,5 +627,23 @@ mod tests {
             3,
             "it locks up after each of them"
         );
+    }
+
+    /// On the F405 the CCM hangs on the D-bus alone, and peripherals are Execute Never.
+    #[test]
+    fn nothing_is_executed_from_ccm_or_registers() {
+        for (target, first, reached) in [
+            (SRAM_START, STORE, SRAM_START),
+            (CCM_START, STORE, HANDLER),
+            (0xE004_2000, STORE, HANDLER),
+            // GPIOA, whose clock is off: a load from there would end the run.
+            (0x4002_0000, NOP, HANDLER),
+        ] {
+            let mut machine = machine([target, HERE.into()], [first, TO_THUMB, JUMP], HERE);
+            machine.run_until(Ticks::from_millis(1)).unwrap();
+            assert_eq!(machine.cpu().pc(), reached, "{target:#010X}");
+            let exception = if reached == HANDLER { 3 } else { 0 };
+            assert_eq!(machine.cpu().current_exception(), exception);
+        }
     }
 }
