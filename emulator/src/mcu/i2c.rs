@@ -5,7 +5,8 @@
 //! the lines. The clock follows from CCR alone: rise times of the lines are not added to its period.
 //!
 //! Not modelled, and an error where the software asks for it: slave mode, 10-bit addresses, SMBus, PEC, DMA. An own
-//! address is stored but nobody on this board calls it.
+//! address is stored but nobody on this board calls it. Not modelled, and no error: that the software must not write CR1
+//! while START, STOP or PEC is set (RM0090, I2C_CR1); such a write is taken as any other.
 //!
 //! Where the manual is silent:
 //! - SR1 followed by SR2 (or DR) clears a flag that rose between the two, as the note at SR2 says of ADDR.
