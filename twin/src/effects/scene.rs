@@ -857,7 +857,10 @@ impl<'a> Battery<'a> {
                 let first = end
                     - gap_ah(ends, gap_s, excess_ah, self.efficiency) / self.capacity_ah
                     + of_segment(&self.gap_soc_shift, index).unwrap_or_default();
-                if of_segment(&self.base.gap_soc_sigma, index).is_some_and(|sigma| sigma > 0.0) {
+                let is_open =
+                    of_segment(&self.base.gap_soc_sigma, index).is_some_and(|sigma| sigma > 0.0);
+                // Where more flowed than by the line, that is no picture of the current.
+                if is_open || excess_ah != 0.0 {
                     let mean_a = (end - first) / (per_as * gap_s);
                     self.gap_mean_a.push((rows.start, mean_a));
                 }
@@ -879,7 +882,7 @@ impl<'a> Battery<'a> {
         self.soc = soc.into();
     }
 
-    /// The mean current over gaps over which the charge is not known, in A, times the factor on every resistance: where each ends.
+    /// The mean current over gaps over which it was no straight line, or may not have been, in A, times the factor on every resistance: where each ends.
     pub fn driven_over_gaps(&self) -> Vec<(usize, f64)> {
         let gaps = self.gap_mean_a.iter();
         gaps.map(|(row, mean_a)| {
