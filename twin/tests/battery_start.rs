@@ -134,6 +134,41 @@ fn each_operation_has_a_start_of_its_own() {
 }
 
 #[test]
+fn where_operations_begin_is_said_once_and_as_not_stated_only_if_it_is_not() {
+    let operations: Vec<String> = (0..6)
+        .map(|k| operation(AS_DESIGNED, 0.95 - 0.08 * k as f64, 0.0, k, k as u64))
+        .collect();
+    for (stated, more) in [(false, ""), (true, "initial_soc = 0.95")] {
+        for count in [1, 2, 6] {
+            let remarks = common::prepared(&log(&operations[..count]), &model(more)).remarks;
+            let of = |part: &str| {
+                remarks
+                    .iter()
+                    .filter(|remark| remark.contains(part))
+                    .count()
+            };
+            assert_eq!(
+                of("initial_soc is not stated"),
+                usize::from(!stated),
+                "{remarks:?}"
+            );
+            assert_eq!(
+                of("further operation"),
+                usize::from(count > 1),
+                "{remarks:?}"
+            );
+            assert_eq!(of("stretch"), 0, "{remarks:?}");
+            let expected = match count {
+                2 => "1 further operation begins where its first reading of v_cell_v says, 87.",
+                6 => "5 further operations begin where their first reading of v_cell_v says, 5",
+                _ => continue,
+            };
+            assert_eq!(of(expected), 1, "{remarks:?}");
+        }
+    }
+}
+
+#[test]
 fn a_stated_start_that_is_off_is_told_beside_what_imitates_it() {
     for (begins, more) in [
         (0.8, "initial_soc = 0.9"),

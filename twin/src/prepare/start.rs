@@ -11,6 +11,7 @@ use crate::{
     explain::slope::BASE_OFF,
     model::{BEYOND_SOC, Battery},
     problem::{BatteryBase, Drive, Observed, View},
+    report::format::count,
 };
 
 /// Uncertainty of a cell's voltage from which a state of charge is taken: what the cell has not relaxed from, in V.
@@ -63,6 +64,7 @@ pub(super) fn find(
     let mut end = 1.0;
     let mut bridged = 0;
     let mut open: Vec<f64> = Vec::new();
+    let mut further = Further::default();
     for (index, own) in drive.segments.iter().enumerate() {
         let mut excess_ah = 0.0;
         let mut gap_sigma = 0.0;
@@ -102,7 +104,7 @@ pub(super) fn find(
             }
             end - left_ah(excess_ah) / battery.capacity_ah
         } else {
-            let (first, sigma) = begun(work, base, readings, battery, index);
+            let (first, sigma) = begun(work, base, readings, battery, index, &mut further);
             base.initial_soc_sigma.push(sigma);
             first
         };
@@ -111,6 +113,7 @@ pub(super) fn find(
         base.gap_soc_sigma.push(gap_sigma);
         end = first - flowed(base, drive, own.clone());
     }
+    further.tell(work, readings.name);
     if bridged > 0 {
         work.remark(format!(
             "{bridged} gaps in the current: the charge over them is taken from a straight line between its ends"
@@ -164,6 +167,40 @@ pub(super) fn leave_out(
     }
 }
 
+/// The operations after the first, each of which begins somewhere of its own, whatever is stated of the first.
+#[derive(Debug, Default)]
+struct Further {
+    /// States of charge that a first reading tells, 0 … 1.
+    told: Vec<f64>,
+    /// How many there are that no reading tells of.
+    untold: usize,
+}
+
+impl Further {
+    /// A log may have hundreds of them: what is said is said of all.
+    fn tell(&self, work: &mut Work<'_>, name: &str) {
+        let ends = self.told.iter().fold(None, |ends, &soc| {
+            let [low, high] = ends.unwrap_or([soc, soc]);
+            Some([f64::min(low, soc), f64::max(high, soc)])
+        });
+        match (ends.map(|ends| ends.map(|soc| 100.0 * soc)), self.told.len()) {
+            (Some([soc, _]), 1) => work.remark(format!(
+                "1 further operation begins where its first reading of {name} says, {soc:.1} %"
+            )),
+            (Some([low, high]), told) => work.remark(format!(
+                "{told} further operations begin where their first reading of {name} says, {low:.1} … {high:.1} %"
+            )),
+            (None, _) => {}
+        }
+        if self.untold > 0 {
+            work.remark(format!(
+                "{} whose beginning {name} does not tell: a full battery is assumed there",
+                count(self.untold, "further operation")
+            ));
+        }
+    }
+}
+
 /// Where an operation begins, at a segment: as stated, if that is of this operation, else as its first reading tells.
 fn begun(
     work: &mut Work<'_>,
@@ -171,10 +208,12 @@ fn begun(
     readings: &Readings<'_>,
     battery: &Battery,
     index: usize,
+    further: &mut Further,
 ) -> Soc {
     let sigma = battery.initial_soc_uncertainty;
     let stated = battery.initial_soc.map(|soc| (soc, sigma));
-    let stated = stated.filter(|_| readings.clocks[index] == 0);
+    let is_first = readings.clocks[index] == 0;
+    let stated = stated.filter(|_| is_first);
     let name = readings.name;
     let seen = if stated.is_some() && work.purpose == Purpose::Compare {
         None
@@ -198,21 +237,24 @@ fn begun(
             seen
         }
         (None, Some(seen)) => {
-            work.remark(format!(
-                "initial_soc is not stated: {} taken from the first reading of {name}{}",
-                told(seen),
-                if index == 0 {
-                    String::new()
-                } else {
-                    format!(" of stretch {}", index + 1)
-                }
-            ));
+            if is_first {
+                work.remark(format!(
+                    "initial_soc is not stated: {} taken from the first reading of {name}",
+                    told(seen)
+                ));
+            } else {
+                further.told.push(seen.0);
+            }
             (seen.0, sigma.max(seen.1))
         }
         (None, None) => {
-            work.remark(format!(
-                "initial_soc is not stated and {name} does not tell it: a full battery is assumed"
-            ));
+            if is_first {
+                work.remark(format!(
+                    "initial_soc is not stated and {name} does not tell it: a full battery is assumed"
+                ));
+            } else {
+                further.untold += 1;
+            }
             (1.0, 1.0)
         }
     }
