@@ -4,6 +4,8 @@
 // A drive of one segment is a list of one range.
 #![allow(clippy::single_range_in_vec_init)]
 
+#[path = "common/command.rs"]
+mod command;
 #[path = "../../core-logic/tests/support/host_board.rs"]
 mod host_board;
 #[path = "../../core-logic/tests/support/ideal_board.rs"]
@@ -11,6 +13,7 @@ mod ideal_board;
 
 use std::{fs, path::Path};
 
+use command::{SIMULATE, twin};
 use core_logic::configuration::Configuration;
 use host_board::{HostBoard, Step};
 use ideal_board::{Event, Row, Timing};
@@ -532,6 +535,55 @@ fn a_step_can_be_left_out() {
         let stepped = format!("step = 0.5\n{effects}");
         assert_eq!(simulated(&stepped, Readings::Unrounded), plain);
         assert_ne!(simulated(&stepped, Readings::Stepped), plain);
+    }
+}
+
+/// Unrounded, a counter with a step is one without, of readings without one.
+#[test]
+fn a_counters_step_can_be_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let counted = |step: &str, step_c: &str, readings: Readings| {
+        let text = format!("schema = 1\n[sensor]\n{step}[charge]\n{step_c}");
+        let (model, prepared) = prepared(folder.path(), &text, &recording(), Purpose::Simulate);
+        let written = columns(&model, &prepared, readings);
+        let found = written.iter().find(|(name, _)| name == "q_meas_c");
+        found.unwrap().1.clone()
+    };
+    let plain = counted("", "", Readings::Stepped);
+    for (step, step_c) in [
+        ("step = 5\n", ""),
+        ("", "step_c = 20\n"),
+        ("step = 5\n", "step_c = 20\n"),
+    ] {
+        // Not assert_eq: it would show thousands of numbers.
+        assert!(
+            counted(step, step_c, Readings::Unrounded) == plain,
+            "{step}{step_c}"
+        );
+        assert!(
+            counted(step, step_c, Readings::Stepped) != plain,
+            "{step}{step_c}"
+        );
+    }
+}
+
+/// A board's readings are codes, with and without `--no-step`; that is said, and of no other sensor.
+#[test]
+fn that_a_boards_codes_stay_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    fs::write(folder.join("r.csv"), recording()).unwrap();
+    for (front_end, is_board) in [("pair", false), ("dual-range", true), ("network", true)] {
+        let model = format!("schema = 1\n[sensor]\nfront_end = \"{front_end}\"\n");
+        fs::write(folder.join("m.toml"), model).unwrap();
+        for no_step in [false, true] {
+            let more = if no_step { &["--no-step"][..] } else { &[] };
+            let arguments: Vec<&str> = SIMULATE.iter().chain(more).copied().collect();
+            let output = twin(folder, &arguments);
+            assert_eq!(output.status.code(), Some(0), "{output:?}");
+            let said = String::from_utf8(output.stdout).unwrap();
+            assert_eq!(said.contains("--no-step"), is_board && no_step, "{said}");
+        }
     }
 }
 

@@ -101,10 +101,21 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
         names.join(", "),
         arguments.recording.display()
     );
-    for remark in &prepared.remarks {
+    let codes = codes_stay(&model).filter(|_| arguments.no_step);
+    for remark in prepared.remarks.iter().chain(&codes) {
         text.push_str(&format!("\n{remark}"));
     }
     Ok(text)
+}
+
+/// A board's readings are whole codes however they are written.
+fn codes_stay(model: &Model) -> Option<String> {
+    let sensor = model.sensor.as_ref()?;
+    Board::new(sensor.front_end, sensor.average.unwrap_or(1))?;
+    Some(
+        "--no-step: a board's readings are its converter's codes, and its charge its meter's counts: they stay as they are"
+            .to_owned(),
+    )
 }
 
 /// Time and the simulated signals, one row for each of the recording.
@@ -131,7 +142,7 @@ pub fn columns(model: &Model, prepared: &Prepared, readings: Readings) -> Vec<(S
         .items
         .iter()
         .find(|item| item.problem.view == View::Sensor);
-    if let (Some(item), Some(charge)) = (sensor, counter(model, prepared)) {
+    if let (Some(item), Some(charge)) = (sensor, counter(model, prepared, readings)) {
         let name = model
             .charge
             .as_ref()
@@ -165,7 +176,7 @@ pub fn predicted(item: &Item, readings: Readings) -> Vec<f64> {
 
 /// The charge counter, in C: the board's meter as designed, or the sum of the sensor's readings for a pair that says it
 /// has a counter.
-fn counter(model: &Model, prepared: &Prepared) -> Option<Vec<f64>> {
+fn counter(model: &Model, prepared: &Prepared, readings: Readings) -> Option<Vec<f64>> {
     let item = prepared
         .items
         .iter()
@@ -191,17 +202,13 @@ fn counter(model: &Model, prepared: &Prepared) -> Option<Vec<f64>> {
         return Some(charge_c);
     }
     let charge = model.charge.as_ref()?;
-    let step = charge.step_c;
-    let counted = integral_c(problem, &predicted(item, Readings::Stepped))
-        .into_iter()
-        .map(|sum| {
-            if step > 0.0 {
-                (sum / step).floor() * step
-            } else {
-                sum
-            }
-        });
-    Some(counted.collect())
+    let mut counted = integral_c(problem, &predicted(item, readings));
+    if charge.step_c > 0.0 && readings == Readings::Stepped {
+        for sum in &mut counted {
+            *sum = (*sum / charge.step_c).floor() * charge.step_c;
+        }
+    }
+    Some(counted)
 }
 
 /// Charge of a current, in A, at the observed rows: straight lines between them, nothing over gaps.
