@@ -172,6 +172,11 @@ impl Parameter {
         self
     }
 
+    /// The equation divides by it.
+    const fn above_nothing(self) -> Self {
+        self.within(f64::MIN_POSITIVE, f64::INFINITY)
+    }
+
     const fn internal(name: &'static str, unit: &'static str, off: f64, search: Search) -> Self {
         Self {
             name,

@@ -204,6 +204,9 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
             checks::enough(&item.problem, frame.source())?;
         }
     }
+    for item in &items {
+        checks::can_be_simulated(model, &item.problem, purpose, frame.source())?;
+    }
     // One battery is behind all of its columns.
     let of_view = |view| items.iter().find(|item| item.problem.view == view);
     if let Some(remark) = of_view(View::Voltage)

@@ -1076,6 +1076,26 @@ fn a_delay_beyond_the_recording() {
 }
 
 #[test]
+fn effects_under_which_nothing_can_be_simulated() {
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(300, |t| {
+            format!("{t},{},{}", 20.0 + current(t), 20.5 + current(t))
+        });
+    for front_end in ["pair", "dual-range"] {
+        let model = format!(
+            "schema = 1\n[sensor]\nfront_end = \"{front_end}\"\n[effects.gain]\ngain = 1e308\n[effects.offset]\noffset_a = 1\n"
+        );
+        let files = [("m.toml", model.as_str()), ("r.csv", recording.as_str())];
+        for arguments in [&EXPLAIN, &SIMULATE] {
+            says(
+                &refused(&files, arguments),
+                &["m.toml", "effects.gain", "r.csv", "i_meas_a", "0 of 300"],
+            );
+        }
+    }
+}
+
+#[test]
 fn voltages_that_were_read_beyond_the_recording() {
     let recording = "t_s,i_ref_a,v_cell_v\n".to_owned()
         + &rows(300, |t| {

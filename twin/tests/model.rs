@@ -87,7 +87,7 @@ fn the_models_of_this_project_are_read() {
 
 #[test]
 fn faults_name_line_key_and_what_was_expected() {
-    let cases: [(&str, &[&str]); 40] = [
+    let cases: [(&str, &[&str]); 45] = [
         (
             "schema = 1\n[sensor]\nstepp = 1\n",
             &["line 3", "stepp", "`step`", "`noise_coloured`"],
@@ -263,6 +263,27 @@ fn faults_name_line_key_and_what_was_expected() {
         (
             "schema = 1\n[battery]\ncapacity_ah = 2\n[effects.capacity]\ncapacity_ah = 0\n",
             &["capacity.capacity_ah", "found 0", "above 0"],
+        ),
+        // What is divided by is above nothing.
+        (
+            "schema = 1\n[sensor]\n[effects.core-hysteresis]\nremanence_a = 1\ncoercivity_a = 0\n",
+            &["core-hysteresis.coercivity_a", "found 0", "above 0"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.core-hysteresis]\nremanence_a = 1\ncoercivity_a = 2\nspread = 0\n",
+            &["core-hysteresis.spread", "found 0", "above 0"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.core-hysteresis]\nremanence_a = 1\ncoercivity_a = 0\nbeta = 1\n",
+            &["core-hysteresis.coercivity_a", "found 0", "above 0"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.core-hysteresis]\nremanence_a = 1\ncoercivity_a = 2\nbeta = 0\n",
+            &["core-hysteresis.beta", "found 0", "above 0"],
+        ),
+        (
+            "schema = 1\n[battery]\ncapacity_ah = 2\n[effects.charge-transfer]\ni0_a = 0\n",
+            &["charge-transfer.i0_a", "found 0", "above 0"],
         ),
         (
             "schema = 1\n[sensor]\n[effects.capacity]\ncapacity_ah = 40\n",

@@ -12,10 +12,7 @@ static CARD: Card = Card {
     id: "capacity",
     statement: "The capacity of the battery is not the rated one.",
     equation: "dSoC/dt = −i/(3600·capacity)",
-    parameters: &[
-        Parameter::new("capacity_ah", "Ah", f64::NAN, Search::Smooth)
-            .within(f64::MIN_POSITIVE, f64::INFINITY),
-    ],
+    parameters: &[Parameter::new("capacity_ah", "Ah", f64::NAN, Search::Smooth).above_nothing()],
     shows: "state of charge and open-circuit voltage scale",
     looks_like: &["gain"],
     separated_by: "a discharge over a known span of state of charge with a rest at both ends",

@@ -20,12 +20,7 @@ static CARD: Card = Card {
     id: "charge-transfer",
     statement: "The overvoltage of the electrode reactions grows with the logarithm of a large current, not in proportion to it (Butler–Volmer).",
     equation: "v = −(2RT/F)·(asinh x − x), x = i/(2·i0·k); k: R25/R as of temperature and state of charge (resistance-temperature, cell-self-heating, resistance-soc), 1 without them (Newman & Thomas-Alyea 2004)",
-    parameters: &[Parameter::new(
-        "i0_a",
-        "A",
-        f64::INFINITY,
-        Search::Logarithmic,
-    )],
+    parameters: &[Parameter::new("i0_a", "A", f64::INFINITY, Search::Logarithmic).above_nothing()],
     shows: "large currents drop less voltage than small ones promise, the more so in the cold",
     looks_like: &["resistance-temperature", "polarisation"],
     separated_by: "pulses of several sizes at one state of charge and one temperature",

@@ -49,15 +49,19 @@ pub static ADDED: CoreHysteresis = CoreHysteresis {
 
 static PARAMETERS: [Parameter; 5] = [
     Parameter::new("remanence_a", "A", 0.0, Search::Linear),
-    Parameter::new("coercivity_a", "A", 1.0, Search::Logarithmic),
-    Parameter::new("spread", "1", 1.0, Search::Logarithmic).open(),
+    Parameter::new("coercivity_a", "A", 1.0, Search::Logarithmic).above_nothing(),
+    Parameter::new("spread", "1", 1.0, Search::Logarithmic)
+        .open()
+        .above_nothing(),
     Parameter::new("scatter", "1", 1.0, Search::Logarithmic).open(),
     BEFORE,
 ];
 static DRAGGING: [Parameter; 4] = [
     Parameter::new("remanence_a", "A", 0.0, Search::Linear),
-    Parameter::new("coercivity_a", "A", 1.0, Search::Logarithmic),
-    Parameter::new("beta", "1", 0.5, Search::Logarithmic).open(),
+    Parameter::new("coercivity_a", "A", 1.0, Search::Logarithmic).above_nothing(),
+    Parameter::new("beta", "1", 0.5, Search::Logarithmic)
+        .open()
+        .above_nothing(),
     BEFORE,
 ];
 /// What it had kept when the recording began, as a share of the remanence. Only the first rows show it, so no other block foretells it:

@@ -2,9 +2,10 @@
 
 use recording::error::number;
 
-use super::{FEWEST_ROWS, Frame, battery::PACK, seconds, series::median, stairs};
+use super::{FEWEST_ROWS, Frame, Purpose, battery::PACK, seconds, series::median, stairs};
 use crate::{
     effects::{self, Stage, scene::integral},
+    explain,
     failure::Failure,
     model::{Model, Sensor},
     problem::{Base, BatteryBase, Drive, Observed, Problem, View},
@@ -188,6 +189,60 @@ pub(super) fn moments(model: &Model, problem: &Problem) -> Result<(), Failure> {
         }
     }
     Ok(())
+}
+
+/// Values of the model file under which the simulation is no number are refused: nothing could be compared with it, or written.
+pub(super) fn can_be_simulated(
+    model: &Model,
+    problem: &Problem,
+    purpose: Purpose,
+    source: &str,
+) -> Result<(), Failure> {
+    if problem.modelled.is_empty() {
+        return Ok(());
+    }
+    let observed = &problem.observed;
+    let numbers = |problem: &Problem| {
+        let said = explain::predict(problem, &[]).into_iter();
+        said.zip(&observed.valid)
+            .filter(|(value, valid)| **valid && value.is_finite())
+            .count()
+    };
+    let rows = observed.valid_rows();
+    let least = if purpose.compares() {
+        FEWEST_ROWS
+    } else {
+        // A drive of a few rows can be simulated, and an effect may reach out of it.
+        FEWEST_ROWS.min(rows.div_ceil(2))
+    };
+    let found = numbers(problem);
+    if found >= least {
+        return Ok(());
+    }
+    let alone = |index: &usize| {
+        let mut alone = problem.clone();
+        alone.modelled = vec![problem.modelled[*index].clone()];
+        if let Base::Sensor(base) = &mut alone.base {
+            // It holds what all of them do.
+            base.reading.clear();
+        }
+        numbers(&alone) < least
+    };
+    let every = 0..problem.modelled.len();
+    let at_fault = match every.clone().find(alone) {
+        Some(index) => index..index + 1,
+        None => every,
+    };
+    let keys: Vec<String> = problem.modelled[at_fault]
+        .iter()
+        .map(|(id, _)| format!("effects.{id}"))
+        .collect();
+    Err(Failure(format!(
+        "{}, key {}: found values with which {found} of {rows} simulated readings of {} for {source} are numbers, expected at least {least}",
+        model.source,
+        keys.join(" and "),
+        problem.name
+    )))
 }
 
 /// There is enough to say something.
