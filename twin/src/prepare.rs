@@ -247,7 +247,8 @@ fn nothing_to_compare(model: &Model, frame: &Frame) -> Failure {
         frame.source(),
         frame.names().join(", "),
         wanted.join(", or "),
-        model.source
+        model.source,
+        frame.absent()
     ))
 }
 

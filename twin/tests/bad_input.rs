@@ -1139,6 +1139,44 @@ fn columns_by_other_names_are_hinted_at() {
     );
 }
 
+/// A column that is needed and that the model file calls by a name that the file does not have.
+#[test]
+fn the_model_files_name_of_a_column_that_is_needed() {
+    let sensor = |line: &str| format!("schema = 1\n[columns]\n{line}\n[sensor]\n");
+    for (name, line, lacking) in [
+        ("i_ref_a", "i_ref_a = \"Shunt\"", "columns.i_ref_a"),
+        ("i_meas_a", "i_meas_a = \"-Board\"", "columns.i_meas_a"),
+        ("t_s", "t_s = \"Time\"", "columns.t_s"),
+    ] {
+        let recording = good().replacen(name, "other", 1);
+        says(
+            &explained(&sensor(line), &recording),
+            &["r.csv", &format!("\"{name}\""), "m.toml", lacking],
+        );
+    }
+    let battery = "schema = 1\n[columns]\nv_cell_v = \"U\"\n[battery]\ncapacity_ah = 2\nocv = [[0, 3.0], [1, 4.0]]\n";
+    says(
+        &explained(battery, &good()),
+        &["r.csv", "soc_pct, v_cell_v or v_pack_v", "columns.v_cell_v"],
+    );
+    // A column that is there and holds text is still refused, and so is what the command line asks for.
+    let text = "t_s,i_ref_a,i_meas_a,T7\n".to_owned()
+        + &rows(300, |t| {
+            format!("{t},{},{},warm", current(t), current(t) + 0.5)
+        });
+    says(
+        &explained(&sensor("temp_sensor_c = \"T7\""), &text),
+        &["r.csv", "T7"],
+    );
+    says(
+        &refused(
+            &[("m.toml", PAIR), ("r.csv", &good())],
+            &explain_with(&["--map", "temp_sensor_c=T7"]),
+        ),
+        &["r.csv", "T7"],
+    );
+}
+
 #[test]
 fn a_hold_out_of_which_a_piece_was_fitted() {
     let whole = "t_s,i_ref_a,i_meas_a\n".to_owned()

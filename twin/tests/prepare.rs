@@ -375,6 +375,83 @@ fn a_minus_turns_the_sign() {
 }
 
 #[test]
+fn a_column_of_the_model_file_that_a_recording_lacks_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let rows = |more: bool| {
+        (0..200).map(move |k| {
+            let t = f64::from(k) * 0.1;
+            let mut row = vec![t, current(t), current(t) + 0.5];
+            row.extend(more.then_some(20.0 + t));
+            row
+        })
+    };
+    let without = text("t_s,Shunt,i_meas_a", rows(false));
+    let columns = "schema = 1\n[columns]\ni_ref_a = \"Shunt\"\ntemp_sensor_c = \"-T7\"\n[sensor]\n";
+    let prepared = read(folder.path(), columns, &without, &[]).unwrap();
+    let says = |prepared: &Prepared| {
+        let remarks = prepared.remarks.iter();
+        remarks
+            .filter(|remark| remark.contains("columns.temp_sensor_c"))
+            .count()
+    };
+    assert_eq!(says(&prepared), 1, "{:?}", prepared.remarks);
+    assert!(
+        prepared.items[0]
+            .problem
+            .drive
+            .sensor_temperature_c
+            .is_none()
+    );
+    assert_eq!(
+        prepared.items[0].problem.observed.value[5],
+        current(0.5) + 0.5
+    );
+    // Where it is, either way, nothing is said.
+    for name in ["T7", "-T7"] {
+        let with = text(&format!("t_s,Shunt,i_meas_a,{name}"), rows(true));
+        let prepared = read(folder.path(), columns, &with, &[]).unwrap();
+        assert_eq!(says(&prepared), 0, "{:?}", prepared.remarks);
+        assert!(
+            prepared.items[0]
+                .problem
+                .drive
+                .sensor_temperature_c
+                .is_some()
+        );
+    }
+    // In a file beside it, it is there too.
+    let reference = (0..2000).map(|k| {
+        let t = f64::from(k) * 0.01;
+        vec![t, current(t), 20.0 + t]
+    });
+    fs::write(
+        folder.path().join("ref.csv"),
+        text("t_s,Shunt,T7", reference),
+    )
+    .unwrap();
+    fs::write(
+        folder.path().join("r.csv"),
+        text("t_s,i_meas_a", rows(false).map(|row| vec![row[0], row[2]])),
+    )
+    .unwrap();
+    let inputs = Inputs {
+        recording: folder.path().join("r.csv"),
+        reference: Some(folder.path().join("ref.csv")),
+        mapping: Vec::new(),
+    };
+    let model = Model::parse("m.toml", columns.to_owned(), folder.path()).unwrap();
+    let prepared = prepare(&model, &inputs, Purpose::Compare).unwrap();
+    assert_eq!(says(&prepared), 0, "{:?}", prepared.remarks);
+    assert!(
+        prepared.items[0]
+            .problem
+            .drive
+            .sensor_temperature_c
+            .is_some()
+    );
+}
+
+#[test]
 fn a_counter_becomes_mean_currents_and_a_reset_cuts() {
     // 1 A for 300 s at 0.5 s, with a counter set anew after 150 s.
     let rows = (0..600).map(|k| {

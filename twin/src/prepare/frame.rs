@@ -19,8 +19,18 @@ pub struct Frame {
     recording: Recording,
     /// Names and the columns that they were given to.
     named: Vec<(String, String)>,
-    /// What was taken for missing, or spread.
+    /// What was taken for missing, or spread, and is not there.
     remarks: Vec<String>,
+    /// Names that the model file gives to columns that no file has.
+    absent: Vec<Absent>,
+}
+
+/// A name that the model file gives to a column that no file has.
+#[derive(Clone, Debug)]
+struct Absent {
+    name: String,
+    /// Where it says so, and what is not there.
+    told: String,
 }
 
 impl Frame {
@@ -30,6 +40,7 @@ impl Frame {
             recording,
             named: Vec::new(),
             remarks: Vec::new(),
+            absent: Vec::new(),
         }
     }
 
@@ -73,7 +84,14 @@ impl Frame {
 
     /// A column that must be there.
     pub fn need(&self, name: &str) -> Result<&[f64], Failure> {
-        self.recording.need(name).map_err(hinted)
+        let found = self.recording.need(name);
+        found.map_err(|error| hinted(error, name, &self.absent))
+    }
+
+    /// What the model file calls by names that no file has, to be said at the end of an error; empty if that is nothing.
+    pub fn absent(&self) -> String {
+        let absent = self.absent.iter();
+        absent.map(|absent| format!("; {}", absent.told)).collect()
     }
 
     /// What its reader has to know: which values were taken for missing ones, and which times for coarser than the rows.
@@ -162,23 +180,34 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
         .pairs()
         .map(|(name, column)| (name.to_owned(), column.to_owned()))
         .collect();
-    // --map is said later, so it counts.
+    let recording = convert::table(&inputs.recording)?;
+    let reference = match &inputs.reference {
+        Some(path) => Some(convert::table(path)?),
+        None => None,
+    };
+    let files: Vec<&Table> = std::iter::once(&recording).chain(&reference).collect();
+    let mut absent = Vec::new();
     for (name, column) in &model.columns {
-        if asked.pairs().all(|(known, _)| known != name) {
+        // --map is said later, so it counts.
+        if asked.pairs().any(|(known, _)| known == name) {
+            continue;
+        }
+        // One model serves files that do not all have every column; what --map asks for is meant for these.
+        if files.iter().any(|table| has(table, column)) {
             wanted.push((name.clone(), column.clone()));
+        } else {
+            absent.push(absence(model, &files, name, column));
         }
     }
     let check = |frame: &Frame| {
         frame.refuse_left_out(model)?;
         frame.refuse_no_reading(model)
     };
-    let recording = convert::table(&inputs.recording)?;
-    let Some(reference) = &inputs.reference else {
-        let frame = mapped(recording, &wanted, model)?;
+    let Some(reference) = reference else {
+        let frame = mapped(recording, &wanted, absent, model)?;
         check(&frame)?;
         return Ok((frame, None));
     };
-    let reference = convert::table(reference)?;
     // Each name belongs to the file that has its column; to the recording if both do.
     let (to_reference, rest): (Vec<_>, Vec<_>) = wanted.into_iter().partition(|(name, column)| {
         let has = |table: &Table| {
@@ -197,22 +226,53 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
         .filter(|(_, column)| reference.column(column).is_some());
     let to_reference: Vec<_> = to_reference.into_iter().chain(time).collect();
     let (frame, other) = (
-        mapped(recording, &rest, model)?,
-        mapped(reference, &to_reference, model)?,
+        mapped(recording, &rest, absent.clone(), model)?,
+        mapped(reference, &to_reference, absent, model)?,
     );
     check(&frame)?;
     check(&other)?;
     Ok((frame, Some(other)))
 }
 
-/// A column that is missing may be there by another name.
-fn hinted(error: Error) -> Failure {
-    let hint = if error.kind() == Kind::ColumnMissing {
-        "; other names: --map NAME=COLUMN, or [columns] in the model file"
+/// Whether a file has a column, or the one of which it is the minus, if only as one without numbers.
+fn has(table: &Table, column: &str) -> bool {
+    let column = column.trim();
+    let names = [column, column.strip_prefix('-').unwrap_or(column)];
+    // A column without numbers is refused with its own reason.
+    names.iter().any(|name| table.column(name).is_some()) || table.refuse_left_out(names).is_err()
+}
+
+/// What is said of a column of the model file that no file has.
+fn absence(model: &Model, files: &[&Table], name: &str, column: &str) -> Absent {
+    let sources: Vec<&str> = files.iter().map(|table| table.source()).collect();
+    let own = files.iter().any(|table| table.column(name).is_some());
+    let instead = if own {
+        format!(", whose own {name} is taken")
     } else {
-        ""
+        String::new()
     };
-    Failure(format!("{error}{hint}"))
+    Absent {
+        name: name.to_owned(),
+        told: format!(
+            "{}, key columns.{name}: no column \"{column}\" in {}{instead}",
+            model.source,
+            sources.join(" or ")
+        ),
+    }
+}
+
+/// A column that is missing may be there by another name.
+fn hinted(error: Error, name: &str, absent: &[Absent]) -> Failure {
+    if error.kind() != Kind::ColumnMissing {
+        return Failure::from(error);
+    }
+    let by_model = absent.iter().find(|absent| absent.name == name);
+    let told = by_model
+        .map(|absent| format!("; {}", absent.told))
+        .unwrap_or_default();
+    Failure(format!(
+        "{error}; other names: --map NAME=COLUMN, or [columns] in the model file{told}"
+    ))
 }
 
 /// The column that reads the same current or power as this one.
@@ -231,7 +291,12 @@ fn partner<'a>(model: &'a Model, name: &str) -> Option<&'a str> {
     })
 }
 
-fn mapped(table: Table, wanted: &[(String, String)], model: &Model) -> Result<Frame, Failure> {
+fn mapped(
+    table: Table,
+    wanted: &[(String, String)],
+    absent: Vec<Absent>,
+    model: &Model,
+) -> Result<Frame, Failure> {
     let mut mapping = Mapping::new();
     for (name, column) in wanted {
         mapping.add(name, column)?;
@@ -240,9 +305,12 @@ fn mapped(table: Table, wanted: &[(String, String)], model: &Model) -> Result<Fr
     let used = used(model);
     let mut remarks = codes::leave_out(&mut table, &used, |name| partner(model, name));
     remarks.extend(stamps::spread(&mut table, &used));
+    remarks.extend(absent.iter().map(|absent| absent.told.clone()));
+    let recording = table.into_recording();
     Ok(Frame {
-        recording: table.into_recording().map_err(hinted)?,
+        recording: recording.map_err(|error| hinted(error, "t_s", &absent))?,
         named: wanted.to_vec(),
         remarks,
+        absent,
     })
 }
