@@ -587,6 +587,73 @@ fn that_a_boards_codes_stay_is_said() {
     }
 }
 
+/// Where the reference has a clock of its own, a battery is simulated at the recording's rows, whichever of the two has more of them.
+#[test]
+fn a_battery_beside_another_clock_is_simulated_at_the_recordings_rows() {
+    let load = |t_s: f64| {
+        let k = (t_s / 7.3) as usize;
+        [2.0, 9.0, -3.0, 14.0, 5.0][(31 * k * k + 17 * k) % 101 % 5] + 0.3 * (0.9 * t_s).sin()
+    };
+    let battery = "[battery]\ncapacity_ah = 60\ninitial_soc = 0.9\nocv = [[0, 3], [1, 4]]\n";
+    for (reference_s, recording_s) in [(0.1, 1.0), (1.0, 0.1), (0.5, 0.5)] {
+        let folder = tempfile::tempdir().unwrap();
+        let folder = folder.path();
+        let mut shunt = "t_s,i_ref_a\n".to_owned();
+        for k in 0..=(300.0 / reference_s) as usize {
+            let t_s = k as f64 * reference_s;
+            shunt.push_str(&format!("{t_s},{}\n", load(t_s)));
+        }
+        // The recording lies within it, 100 s later by a clock of its own.
+        let begin_s = 20.0;
+        let mut sensor = "t_s,i_meas_a\n".to_owned();
+        let rows = (260.0 / recording_s) as usize;
+        for k in 0..rows {
+            let since_s = k as f64 * recording_s;
+            sensor.push_str(&format!(
+                "{},{}\n",
+                since_s + 120.0,
+                load(begin_s + since_s) + 0.2
+            ));
+        }
+        let alone = format!("schema = 1\n{battery}");
+        let (model, whole) = prepared(folder, &alone, &shunt, Purpose::Simulate);
+        let whole = columns(&model, &whole, Readings::Stepped);
+        fs::write(folder.join("shunt.csv"), &shunt).unwrap();
+        fs::write(folder.join("sensor.csv"), &sensor).unwrap();
+        let text = format!("schema = 1\n[sensor]\n{battery}");
+        let model = Model::parse("m.toml", text, folder).unwrap();
+        let inputs = Inputs {
+            recording: folder.join("sensor.csv"),
+            reference: Some(folder.join("shunt.csv")),
+            ..Inputs::default()
+        };
+        let beside = prepare(&model, &inputs, Purpose::Simulate).unwrap();
+        let written = columns(&model, &beside, Readings::Stepped);
+        for (name, tolerance) in [("soc_pct", 0.01), ("v_cell_v", 1e-4)] {
+            let of = |written: &[(String, Vec<f64>)]| {
+                written
+                    .iter()
+                    .find(|(known, _)| known == name)
+                    .unwrap()
+                    .1
+                    .clone()
+            };
+            let (there, whole) = (of(&written), of(&whole));
+            assert_eq!(there.len(), rows);
+            for (row, value) in there.iter().enumerate() {
+                let at = (begin_s + row as f64 * recording_s) / reference_s;
+                let before = at as usize;
+                let expected =
+                    whole[before] + (at - before as f64) * (whole[before + 1] - whole[before]);
+                assert!(
+                    (value - expected).abs() < tolerance,
+                    "{reference_s} {recording_s} {name}, row {row}: {value} and {expected}"
+                );
+            }
+        }
+    }
+}
+
 /// What the effects of a model file add to the current, the board's meter counts.
 #[test]
 fn the_meter_counts_what_effects_add() {

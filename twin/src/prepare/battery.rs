@@ -14,7 +14,7 @@ use crate::{
     explain::{self, by_temperature},
     failure::Failure,
     model::Battery,
-    problem::{Accuracy, Base, BatteryBase, Coloured, Observed, Problem, View},
+    problem::{Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, View},
     report::format::at_most,
     simulate::board::Pace,
 };
@@ -110,7 +110,7 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
                 }
                 work.observe(&drive, &parts.rows, &parts.clocks, value, &fresh)
             }
-            None => (series::every_row(&drive), Arc::clone(&parts.rows)),
+            None => unread(work, &drive, &parts.rows, &parts.clocks),
         };
         observed.grid = grid(work, name, &observed);
         let ocv: Vec<(f64, f64)> = battery
@@ -193,6 +193,29 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
         });
     }
     Ok(items)
+}
+
+/// Where a column that was not recorded is simulated: at the recording's rows, which are not the drive's where that is in a file of its
+/// own.
+fn unread(
+    work: &Work<'_>,
+    drive: &Drive,
+    rows: &Arc<Vec<usize>>,
+    clocks: &[usize],
+) -> (Observed, Arc<Vec<usize>>) {
+    if work.clock.is_none() {
+        return (series::every_row(drive), Arc::clone(rows));
+    }
+    let every = work.frame.t_s().len();
+    let (mut observed, rows) = work.observe(
+        drive,
+        rows,
+        clocks,
+        &vec![0.0; every],
+        &Freshness::all(every),
+    );
+    observed.value.fill(f64::NAN);
+    (observed, rows)
 }
 
 /// Cells in series behind a voltage.
