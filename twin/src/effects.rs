@@ -346,6 +346,11 @@ pub trait Effect: Sync {
         sensing(problem)
     }
 
+    /// Columns without any of which it does nothing.
+    fn columns(&self) -> &'static [&'static str] {
+        &[]
+    }
+
     /// Lowest and highest value of a parameter that is still physics.
     fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64);
 
@@ -549,6 +554,23 @@ pub fn find(id: &str) -> Option<&'static dyn Effect> {
         .copied()
         .filter(|effect| effect.card().id == id)
         .max_by_key(|effect| effect.card().parameters.len())
+}
+
+/// The columns of which an effect lacks all, so that it does nothing in a problem beside effects with these ids.
+pub fn lacks<'e>(
+    effect: &dyn Effect,
+    problem: &Problem,
+    mut beside: impl Iterator<Item = &'e str>,
+) -> Option<String> {
+    let columns = effect.columns();
+    let is_there = |name: &&str| problem.drive.surrounding(name).is_some();
+    if columns.is_empty() || columns.iter().any(is_there) {
+        return None;
+    }
+    // A cell that warms itself has a temperature that nobody recorded.
+    let heated = cell_self_heating::CellSelfHeating.card().id;
+    let warms = columns.contains(&"temp_cell_c") && beside.any(|id| id == heated);
+    (!warms).then(|| columns.join(" or "))
 }
 
 /// Ids in the order of the table, each once.

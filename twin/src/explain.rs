@@ -303,6 +303,9 @@ fn tell(
     report
         .remarks
         .extend(others.iter().filter_map(|other| other.beyond(model)));
+    report
+        .remarks
+        .extend(others.iter().flat_map(|other| other.idle(model)));
     let off = current_off(bench, &selection).into_iter();
     report
         .remarks

@@ -26,7 +26,9 @@ use held::is_held;
 pub use held::{Freshness, freshness};
 
 use crate::{
-    align, explain,
+    align,
+    effects::{find_with, lacks},
+    explain,
     failure::Failure,
     model::{Model, Sensor, registry},
     problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, Series, View},
@@ -207,6 +209,14 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
     for item in &items {
         checks::can_be_simulated(model, &item.problem, purpose, frame.source())?;
     }
+    let sources = [Some(&frame), reference.as_ref()];
+    for remark in without_columns(
+        model,
+        &items,
+        &sources.map(|frame| frame.map(Frame::source)),
+    ) {
+        work.remark(remark);
+    }
     // One battery is behind all of its columns.
     let of_view = |view| items.iter().find(|item| item.problem.view == view);
     if let Some(remark) = of_view(View::Voltage)
@@ -243,7 +253,7 @@ fn nothing_to_compare(model: &Model, frame: &Frame) -> Failure {
         });
     }
     Failure(format!(
-        "{}: found the columns {}, expected {}; other names: --map NAME=COLUMN, or [columns] in {}",
+        "{}: found the columns {}, expected {}; other names: --map NAME=COLUMN, or [columns] in {}{}",
         frame.source(),
         frame.names().join(", "),
         wanted.join(", or "),
@@ -749,6 +759,29 @@ fn supply_without_range(items: &[Item]) -> Option<String> {
             format!("{ID} is not looked for")
         }
     ))
+}
+
+/// Effects of the model file that do nothing, as nothing was recorded of what they go by.
+fn without_columns(model: &Model, items: &[Item], sources: &[Option<&str>]) -> Vec<String> {
+    let sources: Vec<&str> = sources.iter().copied().flatten().collect();
+    let effects = model.effects.iter();
+    let told = effects.filter_map(|(id, values)| {
+        let effect = find_with(id, values.len())?;
+        let has_it = |item: &&Item| item.problem.modelled.iter().any(|(known, _)| known == id);
+        let mut lacking = items.iter().filter(has_it).map(|item| {
+            let beside = item.problem.modelled.iter().map(|(id, _)| *id);
+            lacks(effect, &item.problem, beside)
+        });
+        // A board's range is known where its rows are, and not to its counter.
+        let first = lacking.next()??;
+        lacking.all(|lacks| lacks.is_some()).then(|| {
+            format!(
+                "[effects.{id}] does nothing here: no column {first} in {}",
+                sources.join(" or ")
+            )
+        })
+    });
+    told.collect()
 }
 
 /// Puts the effects of the model file into a problem, those that act in its view.

@@ -533,6 +533,20 @@ impl Drive {
         self.t_s.len()
     }
 
+    /// What surrounds it, by the name of the column.
+    pub fn surrounding(&self, column: &str) -> Option<&Series> {
+        let series = match column {
+            "temp_sensor_c" => &self.sensor_temperature_c,
+            "v_supply_v" => &self.supply_v,
+            "i_aux_a" => &self.aux_a,
+            "range_high" => &self.range_high,
+            "temp_cell_c" => &self.cell_temperature_c,
+            "temp_ambient_c" => &self.ambient_c,
+            _ => return None,
+        };
+        series.as_ref()
+    }
+
     /// What was recorded of the battery's temperature, in °C: the cell's, else its surroundings'.
     pub fn battery_temperature(&self) -> Option<&Series> {
         self.cell_temperature_c.as_ref().or(self.ambient_c.as_ref())

@@ -1178,6 +1178,47 @@ fn the_model_files_name_of_a_column_that_is_needed() {
 }
 
 #[test]
+fn a_hold_out_without_the_column_of_what_was_found() {
+    let recording = |header: &str, seed: f64, column: bool| {
+        format!("{header}\n")
+            + &rows(1200, |t| {
+                let noise = 0.01 * (seed + 7919.0 * t * t).sin();
+                let warm = 25.0 + 20.0 * (0.05 * t + seed).sin();
+                let reading = current(t) + 0.05 * (warm - 25.0) + noise;
+                if column {
+                    format!("{t},{},{reading},{warm}", current(t))
+                } else {
+                    format!("{t},{},{reading}", current(t))
+                }
+            })
+    };
+    let model = "schema = 1\n[sensor]\nnoise = 0.01\n";
+    let with = recording("t_s,i_ref_a,i_meas_a,temp_sensor_c", 1.0, true);
+    for (other, lacks) in [
+        (recording("t_s,i_ref_a,i_meas_a", 2.0, false), true),
+        (
+            recording("t_s,i_ref_a,i_meas_a,temp_sensor_c", 2.0, true),
+            false,
+        ),
+    ] {
+        let files = [("m.toml", model), ("r.csv", &with), ("h.csv", &other)];
+        let said = report(&files, &["--holdout", "h.csv"]);
+        assert_eq!(
+            said["effects"][0]["id"], "offset-temperature",
+            "{}",
+            said["summary"]
+        );
+        let remark = "h.csv: offset-temperature, found in i_meas_a, does nothing there: no column temp_sensor_c";
+        assert_eq!(
+            said["remarks"].to_string().contains(remark),
+            lacks,
+            "{}",
+            said["remarks"]
+        );
+    }
+}
+
+#[test]
 fn a_hold_out_of_which_a_piece_was_fitted() {
     let whole = "t_s,i_ref_a,i_meas_a\n".to_owned()
         + &rows(900, |t| format!("{t},{},{}", current(t), current(t) + 0.5));

@@ -451,6 +451,105 @@ fn a_column_of_the_model_file_that_a_recording_lacks_is_said() {
     );
 }
 
+/// An effect of the model file that lacks what it goes by does nothing, and that is said.
+#[test]
+fn an_effect_without_its_column_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let sensor = "schema = 1\n[sensor]\nfull_scale = 60\n";
+    let battery = "schema = 1\n[battery]\ncapacity_ah = 2\nocv = [[0, 3.0], [1, 4.0]]\nohmic_resistance_ohm = 0.01\n";
+    let cases: [(&str, &str, &str, &[&str]); 8] = [
+        (
+            sensor,
+            "offset-temperature",
+            "tc_a_per_k = 0.01",
+            &["temp_sensor_c"],
+        ),
+        (
+            sensor,
+            "gain-temperature",
+            "tc_per_k = 0.001",
+            &["temp_sensor_c"],
+        ),
+        (sensor, "stray-field", "coupling = 0.01", &["i_aux_a"]),
+        (
+            sensor,
+            "range-mismatch",
+            "gain_ratio = 1.01\noffset_a = 0.1",
+            &["range_high"],
+        ),
+        (sensor, "range-handover", "tau_s = 0.2", &["range_high"]),
+        (sensor, "supply-ratiometric", "ratio = 0.1", &["v_supply_v"]),
+        (
+            battery,
+            "resistance-temperature",
+            "b_k = 2000",
+            &["temp_cell_c", "temp_ambient_c"],
+        ),
+        (
+            battery,
+            "entropic",
+            "v_per_k = 1e-4",
+            &["temp_cell_c", "temp_ambient_c"],
+        ),
+    ];
+    for (model, id, values, columns) in cases {
+        let model = format!("{model}[effects.{id}]\n{values}\n");
+        let recording = |more: Option<&str>| {
+            let rows = (0..200).map(|k| {
+                let t = f64::from(k) * 0.1;
+                let volts = 3.9 - 0.01 * current(t) + 1e-4 * (7919.0 * t * t).sin();
+                let mut row = vec![t, current(t), current(t) + 0.5, volts];
+                row.extend(more.map(|_| f64::from(k % 40 / 20) + 5.0));
+                row
+            });
+            let more = more.map(|name| format!(",{name}")).unwrap_or_default();
+            text(&format!("t_s,i_ref_a,i_meas_a,v_cell_v{more}"), rows)
+        };
+        let source = folder.path().join("r.csv").display().to_string();
+        let remark = format!(
+            "[effects.{id}] does nothing here: no column {} in {source}",
+            columns.join(" or ")
+        );
+        let says = |more: Option<&str>| {
+            let remarks = read(folder.path(), &model, &recording(more), &[])
+                .unwrap()
+                .remarks;
+            let said = remarks
+                .iter()
+                .filter(|said| said.contains("does nothing here"));
+            (said.cloned().collect::<Vec<_>>(), remarks)
+        };
+        let (said, remarks) = says(None);
+        assert_eq!(said, [remark], "{remarks:?}");
+        for column in columns {
+            let (said, remarks) = says(Some(column));
+            assert!(said.is_empty(), "{column}: {remarks:?}");
+        }
+    }
+    // A cell that warms itself has a temperature.
+    let warm = format!(
+        "{battery}[effects.resistance-temperature]\nb_k = 2000\n[effects.cell-self-heating]\nrth_k_per_w = 5\ntau_s = 10\n"
+    );
+    let rows = (0..200).map(|k| {
+        let t = f64::from(k) * 0.1;
+        vec![t, current(t), 3.9 - 0.01 * current(t)]
+    });
+    let remarks = read(
+        folder.path(),
+        &warm,
+        &text("t_s,i_ref_a,v_cell_v", rows),
+        &[],
+    )
+    .unwrap()
+    .remarks;
+    assert!(
+        !remarks
+            .iter()
+            .any(|said| said.contains("does nothing here")),
+        "{remarks:?}"
+    );
+}
+
 #[test]
 fn a_counter_becomes_mean_currents_and_a_reset_cuts() {
     // 1 A for 300 s at 0.5 s, with a counter set anew after 150 s.

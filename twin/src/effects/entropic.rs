@@ -32,6 +32,10 @@ impl Effect for Entropic {
             && (problem.drive.cell_temperature_c.is_some() || problem.drive.ambient_c.is_some())
     }
 
+    fn columns(&self) -> &'static [&'static str] {
+        &["temp_cell_c", "temp_ambient_c"]
+    }
+
     fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {
         (-MOST_V_PER_K, MOST_V_PER_K)
     }

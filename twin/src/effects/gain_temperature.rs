@@ -28,6 +28,10 @@ impl Effect for GainTemperature {
         sensing(problem) && problem.drive.sensor_temperature_c.is_some()
     }
 
+    fn columns(&self) -> &'static [&'static str] {
+        &["temp_sensor_c"]
+    }
+
     fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {
         (-0.1, 0.1)
     }

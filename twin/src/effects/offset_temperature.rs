@@ -28,6 +28,10 @@ impl Effect for OffsetTemperature {
         sensing(problem) && problem.drive.sensor_temperature_c.is_some()
     }
 
+    fn columns(&self) -> &'static [&'static str] {
+        &["temp_sensor_c"]
+    }
+
     fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
         (-0.2 * scale.full_scale, 0.2 * scale.full_scale)
     }

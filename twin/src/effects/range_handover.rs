@@ -49,6 +49,10 @@ impl Effect for RangeHandover {
         Some(instants_s)
     }
 
+    fn columns(&self) -> &'static [&'static str] {
+        &["range_high"]
+    }
+
     fn bounds(&self, _parameter: usize, scale: &Scale) -> (f64, f64) {
         (2e-3 * scale.step_s, 0.1 * scale.span_s)
     }

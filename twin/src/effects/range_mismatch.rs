@@ -36,6 +36,10 @@ impl Effect for RangeMismatch {
                 .is_some_and(|flag| flag.iter().any(|f| *f > 0.5) && flag.iter().any(|f| *f < 0.5))
     }
 
+    fn columns(&self) -> &'static [&'static str] {
+        &["range_high"]
+    }
+
     fn bounds(&self, parameter: usize, scale: &Scale) -> (f64, f64) {
         if parameter == 0 {
             (0.2, 5.0)

@@ -29,6 +29,10 @@ impl Effect for ResistanceTemperature {
             && (problem.drive.cell_temperature_c.is_some() || problem.drive.ambient_c.is_some())
     }
 
+    fn columns(&self) -> &'static [&'static str] {
+        &["temp_cell_c", "temp_ambient_c"]
+    }
+
     fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {
         // A conductor that is a part of it rises with temperature by 0.4 %/K, that is −350 K.
         // The most: 80 kJ/mol; charge transfer of lithium-ion cells has 50 … 70.

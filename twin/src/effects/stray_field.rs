@@ -28,6 +28,10 @@ impl Effect for StrayField {
         sensing(problem) && problem.drive.aux_a.is_some()
     }
 
+    fn columns(&self) -> &'static [&'static str] {
+        &["i_aux_a"]
+    }
+
     fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {
         (-1.0, 1.0)
     }

@@ -35,6 +35,10 @@ impl Effect for SupplyRatiometric {
         sensing(problem) && problem.drive.supply_v.is_some() && ranged
     }
 
+    fn columns(&self) -> &'static [&'static str] {
+        &["v_supply_v"]
+    }
+
     fn bounds(&self, _parameter: usize, _scale: &Scale) -> (f64, f64) {
         (-3.0, 3.0)
     }

@@ -10,6 +10,7 @@ use super::told::short;
 use super::trust::{WAVERS, roughness};
 use super::workbench::{Model, Workbench};
 use super::{Holdout, Selection, rms, select};
+use crate::effects::lacks;
 use crate::report::data::HoldoutReport;
 
 /// An effect that makes the error in another file larger by this factor is not that file's physics.
@@ -78,6 +79,23 @@ impl<'a> Unfitted<'a> {
         let at_c = model.nuisance.resistances_at_c?;
         let beyond = beyond_known(&self.bench.problem.drive, at_c)?;
         Some(format!("{}: {beyond}", self.file.display()))
+    }
+
+    /// What of a model does nothing there, as the file has nothing of what it goes by.
+    pub(super) fn idle(&self, model: &Model) -> Vec<String> {
+        let problem = self.bench.problem;
+        let stated = problem.modelled.iter().map(|(id, _)| *id);
+        let found = model.members.iter().map(|member| member.id());
+        let idle = model.members.iter().filter_map(|member| {
+            let columns = lacks(member.effect, problem, stated.clone().chain(found.clone()))?;
+            Some(format!(
+                "{}: {}, found in {}, does nothing there: no column {columns}",
+                self.file.display(),
+                member.id(),
+                problem.name
+            ))
+        });
+        idle.collect()
     }
 
     /// Error with a model.
