@@ -426,7 +426,7 @@ fn a_column_of_the_model_file_that_a_recording_lacks_is_said() {
     });
     fs::write(
         folder.path().join("ref.csv"),
-        text("t_s,Shunt,T7", reference),
+        text("Time,Shunt,T7", reference),
     )
     .unwrap();
     fs::write(
@@ -439,7 +439,8 @@ fn a_column_of_the_model_file_that_a_recording_lacks_is_said() {
         reference: Some(folder.path().join("ref.csv")),
         mapping: Vec::new(),
     };
-    let model = Model::parse("m.toml", columns.to_owned(), folder.path()).unwrap();
+    let timed = columns.replacen("[columns]", "[columns]\nt_s = \"Time\"", 1);
+    let model = Model::parse("m.toml", timed, folder.path()).unwrap();
     let prepared = prepare(&model, &inputs, Purpose::Compare).unwrap();
     assert_eq!(says(&prepared), 0, "{:?}", prepared.remarks);
     assert!(

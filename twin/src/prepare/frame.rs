@@ -210,11 +210,7 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
     };
     // Each name belongs to the file that has its column; to the recording if both do.
     let (to_reference, rest): (Vec<_>, Vec<_>) = wanted.into_iter().partition(|(name, column)| {
-        let has = |table: &Table| {
-            let plain = column.strip_prefix('-').unwrap_or(column);
-            table.column(column).is_some() || table.column(plain).is_some()
-        };
-        name != "t_s" && has(&reference) && !has(&recording)
+        name != "t_s" && has(&reference, column) && !has(&recording, column)
     });
     let time: Vec<_> = rest
         .iter()
@@ -225,6 +221,12 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
         .into_iter()
         .filter(|(_, column)| reference.column(column).is_some());
     let to_reference: Vec<_> = to_reference.into_iter().chain(time).collect();
+    // The model file's time may be the reference's alone.
+    let is_asked = |wanted: &str| asked.pairs().any(|(name, _)| name == wanted);
+    let of_recording = |(name, column): &(String, String)| {
+        name != "t_s" || is_asked(name) || has(&recording, column)
+    };
+    let rest: Vec<_> = rest.into_iter().filter(of_recording).collect();
     let (frame, other) = (
         mapped(recording, &rest, absent.clone(), model)?,
         mapped(reference, &to_reference, absent, model)?,
