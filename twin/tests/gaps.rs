@@ -2,12 +2,19 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+mod common;
+
 use std::ops::Range;
 
-use twin::explain::predict;
+use twin::effects::find_with;
+use twin::explain::{
+    predict,
+    workbench::{Member, Model, Workbench},
+};
 use twin::problem::{
     Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, SensorBase, View,
 };
+use twin::report::data::Verdict;
 
 const ROWS: usize = 1200;
 const STEP_S: f64 = 0.5;
@@ -173,6 +180,86 @@ fn clocks_go_on_over_a_gap() {
         ] {
             assert_goes_on(View::Sensor, &sensor, id, &values);
         }
+    }
+}
+
+/// Where a clock points into a gap nobody knows what was there: an effect gains nothing by that.
+#[test]
+fn what_cannot_be_simulated_brings_nothing() {
+    let sensor = Base::Sensor(SensorBase::default());
+    let (mut problem, rows) = problem(View::Sensor, sensor, true);
+    problem.observed.value = rows
+        .iter()
+        .map(|row| current_a(*row) + 0.3 * (0.71 * *row as f64).sin() + 0.1)
+        .collect();
+    problem.noise = 0.3;
+    problem.coloured = Coloured {
+        rms: 0.2,
+        tau_s: 5.0,
+    };
+    let bench = Workbench::new(&problem, &[]);
+    assert_eq!(bench.len(), rows.len());
+    let before = bench.residual(&bench.plain);
+    for ppm in [2000.0, -2000.0, 20_000.0] {
+        let model = Model::default().with(Member {
+            effect: find_with("clock-skew", 1).unwrap(),
+            values: vec![ppm],
+        });
+        let said = bench.everywhere(&model);
+        let after = bench.residual(&bench.run(&model));
+        let unknown = (0..rows.len()).filter(|row| !said[*row].is_finite());
+        assert!(unknown.clone().count() > 2, "{ppm}");
+        for row in unknown {
+            assert_eq!(after[row], before[row], "{ppm}, row {row}");
+        }
+        // The same where the noise is made white, which a reading tells of those after it.
+        let white = bench.whitened().unwrap();
+        let innovations = white.residual(&white.run(&model));
+        for (row, (white, after)) in innovations.iter().zip(white.as_fitted(after)).enumerate() {
+            assert!(
+                (white - after).abs() < 1e-9,
+                "{ppm}, row {row}: {white} and {after}"
+            );
+        }
+    }
+}
+
+/// A clock that is fast is found through gaps all the same: the rows beside them, of which it says nothing, are no mismatch of it.
+#[test]
+fn a_fast_clock_is_found_through_gaps() {
+    for (seed, ppm) in [(1, 600.0), (2, -600.0)] {
+        let mut load_a = common::noise(seed, 8.0);
+        let levels: Vec<f64> = (0..400).map(|_| load_a()).collect();
+        let current_a = |t_s: f64| {
+            let at = (t_s / 1.7).max(0.0);
+            let (level, share) = (at as usize, at.fract());
+            levels[level] + share * (levels[level + 1] - levels[level])
+        };
+        let mut noise_a = common::noise(seed + 50, 0.05);
+        let mut text = "t_s,i_ref_a,i_meas_a\n".to_owned();
+        for row in 0..5000 {
+            let t_s = 0.1 * f64::from(row);
+            if (900..1100).contains(&row) || (3000..3200).contains(&row) {
+                continue;
+            }
+            let reading_a = current_a(t_s / (1.0 + 1e-6 * ppm)) + noise_a();
+            text.push_str(&format!("{t_s},{},{reading_a}\n", current_a(t_s)));
+        }
+        let prepared = common::prepared(&text, "schema = 1\n[sensor]\nnoise = 0.05\n");
+        let report = common::said(prepared.items[0].problem.clone(), 0, &[]);
+        let named: Vec<&str> = report
+            .effects
+            .iter()
+            .map(|effect| effect.id.as_str())
+            .collect();
+        assert_eq!(named, ["clock-skew"], "{}", report.summary);
+        assert!(
+            (report.effects[0].parameters[0].value - ppm).abs() < 30.0,
+            "{}",
+            report.summary
+        );
+        assert_eq!(report.verdict, Verdict::Explained, "{}", report.summary);
+        assert!(report.signals[0].rmse_after < 0.06, "{}", report.summary);
     }
 }
 

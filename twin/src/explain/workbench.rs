@@ -726,12 +726,10 @@ impl<'a> Workbench<'a> {
 
     fn thinned(&self, all: Vec<f64>) -> Vec<f64> {
         let mut here = self.as_compared(self.at_rows(all));
-        if self.is_white() {
-            // Beyond the drive's ends nothing is known: the reading stands there, and says nothing.
-            for (value, y) in here.iter_mut().zip(&self.y) {
-                if !value.is_finite() {
-                    *value = *y;
-                }
+        // What is not known (a clock of another rate points into a gap) stays as designed: a model gains nothing by not saying it.
+        for (value, plain) in here.iter_mut().zip(&self.plain) {
+            if !value.is_finite() {
+                *value = *plain;
             }
         }
         self.as_fitted(here)
@@ -742,7 +740,7 @@ impl<'a> Workbench<'a> {
         let y = self.white.as_ref().map_or(&self.y, |(_, y)| y);
         y.iter()
             .zip(predicted)
-            // Beyond the drive's ends (a delay can reach there) nothing is known.
+            // Nothing is known there, not even as designed.
             .map(|(y, p)| if p.is_finite() { y - p } else { 0.0 })
             .collect()
     }
