@@ -87,7 +87,7 @@ fn the_models_of_this_project_are_read() {
 
 #[test]
 fn faults_name_line_key_and_what_was_expected() {
-    let cases: [(&str, &[&str]); 45] = [
+    let cases: [(&str, &[&str]); 46] = [
         (
             "schema = 1\n[sensor]\nstepp = 1\n",
             &["line 3", "stepp", "`step`", "`noise_coloured`"],
@@ -280,6 +280,10 @@ fn faults_name_line_key_and_what_was_expected() {
         (
             "schema = 1\n[sensor]\n[effects.core-hysteresis]\nremanence_a = 1\ncoercivity_a = 2\nbeta = 0\n",
             &["core-hysteresis.beta", "found 0", "above 0"],
+        ),
+        (
+            "schema = 1\n[sensor]\n[effects.sensor-self-heating]\ntc_per_a2 = 1e-6\ntau_s = 0\nbefore = 0.1\n",
+            &["sensor-self-heating.tau_s", "found 0", "above 0"],
         ),
         (
             "schema = 1\n[battery]\ncapacity_ah = 2\n[effects.charge-transfer]\ni0_a = 0\n",

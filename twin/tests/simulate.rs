@@ -18,7 +18,10 @@ use core_logic::configuration::Configuration;
 use host_board::{HostBoard, Step};
 use ideal_board::{Event, Row, Timing};
 use twin::{
-    effects::scene::mean_flow,
+    effects::{
+        Clues, LIBRARY,
+        scene::{Scale, mean_flow},
+    },
     explain,
     model::{FrontEndKind, Model},
     prepare::{Inputs, Prepared, Purpose, prepare},
@@ -517,6 +520,98 @@ fn steps_and_moments_by_design_hold_with_effects_too() {
         }
         assert!(moved > 300, "{keys}: {moved}");
     }
+}
+
+/// The least that a model file may hold of a value, where that is nothing, is a number in the simulation as well.
+#[test]
+fn nothing_of_a_value_is_a_number_or_is_refused() {
+    let rows = profile();
+    let mut drive = drive(&rows);
+    let count = rows.len();
+    drive.sensor_temperature_c = Some(vec![40.0; count].into());
+    drive.ambient_c = Some(vec![10.0; count].into());
+    drive.supply_v = Some(vec![4.9; count].into());
+    drive.aux_a = Some(vec![30.0; count].into());
+    drive.range_high = Some(
+        rows.iter()
+            .map(|row| f64::from(u8::from(row.current_a.abs() > 50.0)))
+            .collect(),
+    );
+    let sensor = Base::Sensor(SensorBase {
+        full_scale: Some(600.0),
+        ..SensorBase::default()
+    });
+    let battery = Base::Battery(BatteryBase {
+        capacity_ah: 100.0,
+        efficiency: 1.0,
+        initial_soc: vec![0.5],
+        ocv: vec![(0.0, 3.0), (0.5, 3.6), (1.0, 4.1)],
+        cells: 1.0,
+        resistance_ohm: 0.001,
+        ..BatteryBase::default()
+    });
+    let scale = Scale {
+        largest: 150.0,
+        full_scale: 600.0,
+        rms: 60.0,
+        both_ways: 20.0,
+        step_s: 0.1,
+        reading_step_s: 0.1,
+        spectral_step_s: 0.1,
+        even_s: 0.1,
+        fastest_s: 0.002,
+        span_s: 120.0,
+        operation_s: 120.0,
+        capacity_ah: 100.0,
+        resistance_ohm: 0.001,
+        soc: (0.1, 0.9),
+        ..Scale::default()
+    };
+    let clues = Clues {
+        t_s: &[],
+        observed: &[],
+        predicted: &[],
+    };
+    let problems = [
+        (View::Sensor, &sensor),
+        (View::StateOfCharge, &battery),
+        (View::Voltage, &battery),
+    ]
+    .map(|(view, base)| {
+        problem(
+            view,
+            base.clone(),
+            drive.clone(),
+            observed(drive.t_s.clone()),
+        )
+    });
+    let (mut tried, mut lacking) = (0, Vec::new());
+    for effect in LIBRARY {
+        let card = effect.card();
+        for problem in problems.iter().filter(|problem| effect.applies(problem)) {
+            let Some(start) = effect.starts(&scale, &clues).pop() else {
+                continue;
+            };
+            for (p, parameter) in card.parameters.iter().enumerate() {
+                if parameter.limits.0 != 0.0 {
+                    continue;
+                }
+                let mut values = start.clone();
+                values[p] = 0.0;
+                let said = explain::predict(problem, &[(card.id.to_owned(), values.clone())]);
+                let numbers = said.iter().filter(|value| value.is_finite()).count();
+                if numbers != count {
+                    lacking.push(format!(
+                        "{} {}: {numbers} with {values:?}",
+                        card.id, parameter.name
+                    ));
+                }
+                tried += 1;
+            }
+        }
+    }
+    assert!(tried > 15, "{tried}");
+    assert!(lacking.is_empty(), "of {count} rows: {lacking:?}");
 }
 
 /// Unrounded, readings with a step are those without one.

@@ -25,7 +25,7 @@ pub static CUT_OUT: SensorSelfHeating = SensorSelfHeating { card: &CARDS[1] };
 
 static PARAMETERS: [Parameter; 3] = [
     Parameter::new("tc_per_a2", "1/A²", 0.0, Search::Linear),
-    Parameter::new("tau_s", "s", 60.0, Search::Logarithmic),
+    Parameter::new("tau_s", "s", 60.0, Search::Logarithmic).above_nothing(),
     Parameter::internal("before", "1", 0.0, Search::Linear),
 ];
 /// The place of what the heat before the recording does to the gain at its first row, beyond that of the first row's current.
