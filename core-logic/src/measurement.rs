@@ -1422,9 +1422,10 @@ impl Measurement {
     /// The frame `Throughput`.
     #[must_use]
     pub fn throughput(&self) -> can::Throughput {
+        let (charged, discharged) = self.soc.throughput();
         can::Throughput {
-            discharged: self.soc_reading.discharged,
-            charged: self.soc_reading.charged,
+            discharged,
+            charged,
         }
     }
 

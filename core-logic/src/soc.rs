@@ -279,10 +279,6 @@ pub struct SocReading {
     pub anchors: u32,
     /// Charge that did not fit between empty and full since the start (magnitudes added).
     pub clipped: Nanocoulombs,
-    /// Everything ever charged, positive.
-    pub charged: Nanocoulombs,
-    /// Everything ever discharged, positive.
-    pub discharged: Nanocoulombs,
     /// Jumps of the counter that no charge can make (differences beyond 64 bits), since the start.
     pub counter_jumps: u32,
 }
@@ -402,13 +398,31 @@ impl Soc {
     /// What must be saved; with it belongs the counter of the last update.
     #[must_use]
     pub const fn retained(&self) -> SocRetained {
-        let mut kept = self.kept;
-        if self.excursion >= 0 {
-            kept.discharged.0 = add_i64(kept.discharged.get(), self.excursion);
-        } else {
-            kept.charged.0 = sub_i64(kept.charged.get(), self.excursion);
+        let (charged, discharged) = self.throughput();
+        SocRetained {
+            charged,
+            discharged,
+            ..self.kept
         }
-        kept
+    }
+
+    /// Everything ever charged and everything ever discharged, both positive, with the excursion under way.
+    #[must_use]
+    pub const fn throughput(&self) -> (Nanocoulombs, Nanocoulombs) {
+        let SocRetained {
+            charged,
+            discharged,
+            ..
+        } = self.kept;
+        let excursion = self.excursion;
+        if excursion >= 0 {
+            (
+                charged,
+                Nanocoulombs(discharged.get().saturating_add(excursion)),
+            )
+        } else {
+            (Nanocoulombs(sub_i64(charged.get(), excursion)), discharged)
+        }
     }
 
     /// Sets the state of charge, as a host does after service; presented at once.
@@ -488,7 +502,6 @@ impl Soc {
     /// The state of charge as others see it.
     #[must_use]
     pub fn reading(&self, coefficients: &SocCoefficients) -> SocReading {
-        let kept = self.retained();
         SocReading {
             presented: coefficients.share(Nanocoulombs(
                 self.kept.remaining.get() + self.kept.presented_offset.get(),
@@ -500,8 +513,6 @@ impl Soc {
             resting: self.rest_since.is_some(),
             anchors: self.anchors,
             clipped: Nanocoulombs(self.clipped),
-            charged: kept.charged,
-            discharged: kept.discharged,
             counter_jumps: self.counter_jumps,
         }
     }
@@ -528,14 +539,21 @@ impl Soc {
     fn integrate(&mut self, coefficients: &SocCoefficients, delta: i64) {
         let mut remaining = self.kept.remaining.get() - delta;
         self.excursion += delta;
-        if self.excursion.unsigned_abs() >= EXCURSION.get().unsigned_abs() {
-            self.kept = self.retained();
+        if self.excursion >= EXCURSION.get() {
+            self.kept.discharged.0 = self.kept.discharged.get().saturating_add(self.excursion);
+            self.excursion = 0;
+        } else if self.excursion <= -EXCURSION.get() {
+            self.kept.charged.0 = sub_i64(self.kept.charged.get(), self.excursion);
             self.excursion = 0;
         }
-        self.slack = (self.slack + delta).min(EXCURSION.get());
-        if self.slack < 0 {
-            remaining -= self.loss(coefficients, self.slack.unsigned_abs());
-            self.slack = 0;
+        if delta >= 0 {
+            self.slack = (self.slack + delta).min(EXCURSION.get());
+        } else {
+            self.slack += delta;
+            if self.slack < 0 {
+                remaining -= self.loss(coefficients, self.slack.unsigned_abs());
+                self.slack = 0;
+            }
         }
         let limited = remaining.clamp(0, coefficients.capacity);
         if limited != remaining {
@@ -931,8 +949,8 @@ mod tests {
         assert!((bench.reading().estimate.get() - 490_000).abs() <= 1);
         bench.step(10_000, -720 * COULOMB);
         assert_eq!(bench.reading().remaining, Nanocoulombs(18_360 * COULOMB));
-        assert_eq!(bench.reading().discharged, Nanocoulombs(360 * COULOMB));
-        assert_eq!(bench.reading().charged, Nanocoulombs(720 * COULOMB));
+        assert_eq!(bench.soc.throughput().1, Nanocoulombs(360 * COULOMB));
+        assert_eq!(bench.soc.throughput().0, Nanocoulombs(720 * COULOMB));
         assert_eq!(bench.reading().clipped, Nanocoulombs::ZERO);
         assert_eq!(bench.soc.equivalent_cycles_milli(&bench.coefficients), 10);
     }
@@ -963,10 +981,9 @@ mod tests {
             let delta = if net < 0 { 12_860_000 } else { -50_000_000 };
             net += delta;
             bench.step(20_000, delta);
-            let reading = bench.reading();
-            let flowed = reading.discharged.get() - reading.charged.get();
-            assert_eq!(flowed, net, "{poll}");
-            let throughput = reading.charged.saturating_add(reading.discharged);
+            let kept = bench.soc.retained();
+            assert_eq!(kept.discharged.get() - kept.charged.get(), net, "{poll}");
+            let throughput = kept.charged.saturating_add(kept.discharged);
             assert!(throughput < EXCURSION, "{throughput:?} after {poll} polls");
         }
         // As an hour in which nothing was counted to and fro.
@@ -991,8 +1008,7 @@ mod tests {
             bench.step(10_000, 6_700_000);
         }
         assert_eq!(bench.reading().remaining, Nanocoulombs(18_000 * COULOMB));
-        assert_eq!(bench.reading().charged, Nanocoulombs::ZERO);
-        assert_eq!(bench.reading().discharged, Nanocoulombs::ZERO);
+        assert_eq!(bench.soc.throughput(), Default::default());
         // 101 C charged: 1 C in the band, 100 C with 1 % less.
         for _ in 0..101 {
             bench.step(10_000, -COULOMB);
@@ -1364,11 +1380,11 @@ mod tests {
         // The largest difference that is charge, and the next one.
         bench.step(0, 1 << 60);
         assert_eq!(
-            bench.reading().discharged,
+            bench.soc.throughput().1,
             Nanocoulombs(107 * COULOMB + (1 << 60))
         );
         bench.step(0, -(1 << 60) - 1);
-        assert_eq!(bench.reading().charged, Nanocoulombs::ZERO);
+        assert_eq!(bench.soc.throughput().0, Nanocoulombs::ZERO);
         assert_eq!(bench.reading().counter_jumps, 1);
         // A jump that no counter makes is not charge.
         let jump = SocInput {

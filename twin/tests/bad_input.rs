@@ -450,7 +450,7 @@ fn what_is_no_word_where_one_of_a_list_is_needed() {
         for (value, found) in [("1", "integer `1`"), ("true", "boolean `true`")] {
             says(
                 &explained(&model(value), &good()),
-                &["m.toml", "line 3", key, found, "string"],
+                &["m.toml", "line 3", key, found, "text in quotes"],
             );
         }
         let unknown = explained(&model("\"hold\""), &good());
