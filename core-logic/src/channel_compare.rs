@@ -197,7 +197,9 @@ struct Window {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 struct Count {
     at: Instant,
+    /// [`MeterReport::energy`] then, which stands still since.
     energy: i32,
+    /// [`MeterReport::charge_total`] then, which the offsets move on.
     charge: Nanocoulombs,
     /// [`ChannelCompare::flowed`] at the report before, up to which it has counted: what came later may be missing. Moves on with
     /// what is declared.

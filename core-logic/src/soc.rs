@@ -539,6 +539,7 @@ impl Soc {
     fn integrate(&mut self, coefficients: &SocCoefficients, delta: i64) {
         let mut remaining = self.kept.remaining.get() - delta;
         self.excursion += delta;
+        // As [`Self::throughput`] has it, written out: every reading goes through here, and its instructions are bounded.
         if self.excursion >= EXCURSION.get() {
             self.kept.discharged.0 = self.kept.discharged.get().saturating_add(self.excursion);
             self.excursion = 0;

@@ -563,8 +563,8 @@ pub fn lacks<'e>(
     mut beside: impl Iterator<Item = &'e str>,
 ) -> Option<String> {
     let columns = effect.columns();
-    let is_there = |name: &&str| problem.drive.surrounding(name).is_some();
-    if columns.is_empty() || columns.iter().any(is_there) {
+    let mut recorded = problem.drive.surroundings();
+    if columns.is_empty() || recorded.any(|(name, ..)| columns.contains(&name)) {
         return None;
     }
     // A cell that warms itself has a temperature that nobody recorded.

@@ -139,7 +139,7 @@ impl Stretches {
         self.starts[after - 1].1
     }
 
-    /// The rows of a segment, which none may be. Segments ascend with the rows.
+    /// The rows of a segment, empty if it has none. Segments ascend with the rows.
     pub fn of(&self, segment: usize) -> Range<usize> {
         let at = self.starts.partition_point(|(_, of)| *of < segment);
         match self.starts.get(at) {
@@ -533,18 +533,18 @@ impl Drive {
         self.t_s.len()
     }
 
-    /// What surrounds it, by the name of the column.
-    pub fn surrounding(&self, column: &str) -> Option<&Series> {
-        let series = match column {
-            "temp_sensor_c" => &self.sensor_temperature_c,
-            "v_supply_v" => &self.supply_v,
-            "i_aux_a" => &self.aux_a,
-            "range_high" => &self.range_high,
-            "temp_cell_c" => &self.cell_temperature_c,
-            "temp_ambient_c" => &self.ambient_c,
-            _ => return None,
-        };
-        series.as_ref()
+    /// What surrounds it, as far as it was recorded: column, unit and values.
+    pub fn surroundings(&self) -> impl Iterator<Item = (&'static str, &'static str, &Series)> {
+        [
+            ("temp_sensor_c", "°C", &self.sensor_temperature_c),
+            ("v_supply_v", "V", &self.supply_v),
+            ("i_aux_a", "A", &self.aux_a),
+            ("range_high", "1", &self.range_high),
+            ("temp_cell_c", "°C", &self.cell_temperature_c),
+            ("temp_ambient_c", "°C", &self.ambient_c),
+        ]
+        .into_iter()
+        .filter_map(|(column, unit, series)| Some((column, unit, series.as_ref()?)))
     }
 
     /// What was recorded of the battery's temperature, in °C: the cell's, else its surroundings'.

@@ -77,16 +77,7 @@ pub fn variables(bench: &Workbench<'_>) -> Vec<Variable> {
         unit: format!("{unit}/s"),
         values: rate,
     });
-    let environment = [
-        ("temp_sensor_c", "°C", &drive.sensor_temperature_c),
-        ("v_supply_v", "V", &drive.supply_v),
-        ("i_aux_a", "A", &drive.aux_a),
-        ("range_high", "1", &drive.range_high),
-        ("temp_cell_c", "°C", &drive.cell_temperature_c),
-        ("temp_ambient_c", "°C", &drive.ambient_c),
-    ];
-    for (name, unit, series) in environment {
-        let Some(series) = series else { continue };
+    for (name, unit, series) in drive.surroundings() {
         variables.push(Variable {
             name,
             unit: unit.to_owned(),

@@ -19,7 +19,7 @@ pub struct Frame {
     recording: Recording,
     /// Names and the columns that they were given to.
     named: Vec<(String, String)>,
-    /// What was taken for missing, or spread, and is not there.
+    /// What was taken for missing, what was spread, and what is not there.
     remarks: Vec<String>,
     /// Names that the model file gives to columns that no file has.
     absent: Vec<Absent>,

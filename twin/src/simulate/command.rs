@@ -9,7 +9,7 @@ use super::board::Board;
 use crate::{
     explain,
     failure::Failure,
-    model::Model,
+    model::{FrontEndKind, Model},
     prepare::{Inputs, Item, Prepared, Purpose, modelled_change, prepare},
     problem::{Base, Problem, View},
     progress::Progress,
@@ -110,12 +110,11 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
 
 /// A board's readings are whole codes however they are written.
 fn codes_stay(model: &Model) -> Option<String> {
-    let sensor = model.sensor.as_ref()?;
-    Board::new(sensor.front_end, sensor.average.unwrap_or(1))?;
-    Some(
+    let is_board = model.sensor.as_ref()?.front_end != FrontEndKind::Pair;
+    is_board.then(|| {
         "--no-step: a board's readings are its converter's codes, and its charge its meter's counts: they stay as they are"
-            .to_owned(),
-    )
+            .to_owned()
+    })
 }
 
 /// Time and the simulated signals, one row for each of the recording.
