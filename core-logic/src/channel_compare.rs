@@ -18,6 +18,10 @@
 //! doubt of that is half their difference times the gap, or, where conversions were spoiled in between, both
 //! magnitudes times the gap. A window ends at a meter report; its end is evaluated when the conversion that spans it
 //! has come in.
+//!
+//! The sensor's output is a share of its supply, which the converter divides out at once, the meter with a later poll, and both
+//! by a mean of readings. While a reading is off from that mean, the bound has in it what they differ by
+//! ([`ChannelCompare::on_supply`]); other factors begin the comparison anew.
 
 use serde::{Deserialize, Serialize};
 
@@ -192,6 +196,22 @@ struct Window {
     converter: Integral,
 }
 
+/// What the channels may differ by because the sensor's supply moves.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+struct SupplyDoubt {
+    /// Of the current.
+    share: Ppm,
+    /// Of the sensor's output at 0 A.
+    share_at_zero: Ppm,
+    /// Readings of the supply for which it still holds.
+    readings: u8,
+}
+
+/// The longest conversion, at 8 samples a second, may have begun before the supply moved, and the meter follows in 50 ms: by
+/// readings of 10 ms.
+const SUPPLY_DOUBT_READINGS: u8 = 18;
+
 /// A meter that stands still, from the report that showed its last count on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -232,6 +252,7 @@ pub struct ChannelCompare {
     gaps: u32,
     /// Reports of an earlier time are not looked at.
     not_before: Instant,
+    supply_doubt: SupplyDoubt,
     report: CompareReport,
 }
 
@@ -261,6 +282,11 @@ impl ChannelCompare {
             ended: None,
             gaps: 0,
             not_before: Instant::from_ticks(0),
+            supply_doubt: SupplyDoubt {
+                share: Ppm(0),
+                share_at_zero: Ppm(0),
+                readings: 0,
+            },
             report: CompareReport {
                 fast: Outcome::Undecided,
                 slow: Outcome::Undecided,
@@ -447,6 +473,22 @@ impl ChannelCompare {
         self.restart(true);
     }
 
+    /// The newest reading of the sensor's supply is off by `share` from what the channels take it for. The bound is wider by that, or
+    /// by a larger one before it, until both have the same; by `share_at_zero` of the sensor's output at 0 A where one of them has that
+    /// from it too.
+    pub fn on_supply(&mut self, share: Ppm, share_at_zero: Ppm) {
+        let doubt = &mut self.supply_doubt;
+        if share >= doubt.share || doubt.readings == 0 {
+            *doubt = SupplyDoubt {
+                share,
+                share_at_zero,
+                readings: SUPPLY_DOUBT_READINGS,
+            };
+        } else {
+            doubt.readings -= 1;
+        }
+    }
+
     /// Compares from here on. A meter that stands still goes on doing so until it has counted, or its gap is bridged.
     fn restart(&mut self, keep_frozen: bool) {
         self.restart_windows();
@@ -495,11 +537,23 @@ impl ChannelCompare {
         let charge = charge_of(i64::from(current.get()), time);
         let gain = mul_div(
             charge.saturating_abs(),
-            i64::from(config.gain_tolerance.get().max(0)),
+            i64::from(
+                config
+                    .gain_tolerance
+                    .get()
+                    .max(0)
+                    .saturating_add(self.supply_doubt.share.get()),
+            ),
             i64::from(Ppm::ONE.get()),
         );
+        // ADC1 reads less than 7 V: 2 V of 4.5 V are less than 2³¹ here.
+        let at_zero = self
+            .supply_doubt
+            .share_at_zero
+            .get()
+            .wrapping_mul(error_budget::ZERO_AMPS.get(range));
         let zero = config.zero_tolerance.get(range).get().max(0);
-        let doubt = gain.wrapping_add(charge_of(i64::from(zero), time));
+        let doubt = gain.wrapping_add(charge_of(i64::from(zero.saturating_add(at_zero)), time));
         self.integral.charge = self.integral.charge.wrapping_add(charge);
         self.integral.doubt = self.integral.doubt.wrapping_add(doubt);
         if covered {

@@ -217,17 +217,27 @@ pub struct Tick {
     pub changes: Changes,
 }
 
-/// The supply is averaged over 2⁵ readings: one code of ADC1 is 1.6 mV of a 5 V supply, and one of its reference, which stands for
+/// The supply is averaged over 32 readings: one code of ADC1 is 1.6 mV of a 5 V supply, and one of its reference, which stands for
 /// two readings, 3.3 mV. Of 1 code of noise (rms) that leaves 3.3 mV · √(1/31) and 1.6 mV · √(1/63): 0.63 mV.
-const SUPPLY_SHIFT: u32 = 5;
+const SUPPLY_READINGS: i32 = 32;
 /// New factors are worked out for a mean that has moved so far: 0.06 % of the meter's scale, of the 0.1 % that
-/// [`design::SUPPLY_RESIDUAL`] allows. Each time the converter's comparison with the meter begins anew, which takes 2 … 3 s, and
-/// the noise above, 4.8 times less, moves no further in minutes.
+/// [`design::SUPPLY_RESIDUAL`] allows. The noise above, 4.8 times less, moves no further in minutes.
 const SUPPLY_STEP: Microvolts = Microvolts::from_millivolts(3);
 const _: () = assert!(SUPPLY_STEP.get() / 5 < design::SUPPLY_RESIDUAL.get());
-/// A reading further than this from the mean is no noise: the mean begins anew there. Half a per cent, which the meter's
-/// scale would be wrong by for as long as the mean takes to follow; the converter's noise is a tenth of it.
+/// Readings further than this from the mean, [`SUPPLY_CONFIRMATIONS`] in a row on one side of it and no further from each other,
+/// are no noise and no ripple: the mean begins anew there. Half a per cent, which the meter's scale would be wrong by for as long
+/// as the mean takes to follow; the converter's noise is a tenth of it.
 const SUPPLY_JUMP: Microvolts = Microvolts::from_millivolts(25);
+const SUPPLY_CONFIRMATIONS: u8 = 3;
+/// A reading further than this from what the factors are of widens what the channels may differ by. Twice the 0.1 % that the
+/// tolerances have in them, 2.7 times the rms noise of one reading.
+const SUPPLY_DOUBT: Microvolts = Microvolts::from_millivolts(10);
+/// 1 ppm of the lowest supply in µV, rounded down.
+const SUPPLY_PPM: i32 = design::SENSOR_SUPPLY_LOW.get() / 1_000_000;
+const _: () = assert!(
+    SUPPLY_DOUBT.get() as i64 * 1_000_000
+        == 2 * design::SUPPLY_RESIDUAL.get() as i64 * design::SENSOR_NOMINAL_SUPPLY.get() as i64
+);
 /// By then the meter counts with the factors that it is handed: a tick and a poll.
 const METER_FOLLOWS: Duration = Duration::from_ticks(50_000);
 /// Environment readings older than this are missing.
@@ -297,7 +307,11 @@ pub struct Measurement {
     soc_reading: SocReading,
     environment: Environment,
     environment_at: Option<Instant>,
-    supply_sum: Option<i64>,
+    /// The mean; the factors in use are of one up to [`SUPPLY_STEP`] beside it.
+    supply: Option<Microvolts>,
+    /// Readings in a row that say that the supply has jumped.
+    supply_jump: u8,
+    newest_supply: Microvolts,
     cell_voltage: Option<CellVoltage>,
     pack_voltage: Option<Millivolts>,
     vehicle: Vehicle,
@@ -444,6 +458,12 @@ pub fn prepare(configuration: &Configuration, basis: &Basis) -> Prepared {
     }
 }
 
+/// Whether they differ by `limit` or more. Out of line for the image's size.
+#[inline(never)]
+fn is_beyond(a: Microvolts, b: Microvolts, limit: Microvolts) -> bool {
+    a.get().abs_diff(b.get()) >= limit.get().unsigned_abs()
+}
+
 /// When the meter counts by factors that change at `now`.
 fn meter_follows(now: Instant) -> Instant {
     now.checked_add_duration(METER_FOLLOWS).unwrap_or(now)
@@ -517,7 +537,9 @@ impl Measurement {
             soc,
             environment: Environment::default(),
             environment_at: None,
-            supply_sum: None,
+            supply: None,
+            supply_jump: 0,
+            newest_supply: Microvolts(0),
             cell_voltage: None,
             pack_voltage: None,
             vehicle: Vehicle::default(),
@@ -547,8 +569,7 @@ impl Measurement {
             self.key.set_factors(configuration.key_factors);
         }
         let (factors, supply) = (self.key.factors(), self.prepared.supply);
-        self.prepare_again(configuration, factors, supply, self.now);
-        self.compare.restart_at(meter_follows(self.now));
+        self.prepare_again(configuration, factors, supply, true, self.now);
         if converter.configuration() != self.prepared.converter.configuration() {
             // Of two changes in a row: what is under way is of before the first.
             self.retired = self.retired.or(Some(converter.configuration()));
@@ -603,11 +624,14 @@ impl Measurement {
         true
     }
 
+    /// Other factors, in the converter at once and in the meter a little later: unless they differ by the supply alone, what was
+    /// compared by those before says nothing.
     fn prepare_again(
         &mut self,
         configuration: &Configuration,
         factors: KeyFactors,
         supply: Option<Microvolts>,
+        anew: bool,
         now: Instant,
     ) {
         self.basis_number = self.basis_number.wrapping_add(1);
@@ -620,7 +644,11 @@ impl Measurement {
             },
         );
         self.meter_calibration_due = true;
-        self.converter.forget_meter_until(meter_follows(now));
+        if anew {
+            let at = meter_follows(now);
+            self.converter.forget_meter_until(at);
+            self.compare.restart_at(at);
+        }
     }
 
     /// What the meter's owner has to count with.
@@ -826,8 +854,7 @@ impl Measurement {
             },
         );
         if let Some(factors) = self.key_outputs.new_factors {
-            self.prepare_again(configuration, factors, self.prepared.supply, now);
-            self.compare.restart_at(meter_follows(now));
+            self.prepare_again(configuration, factors, self.prepared.supply, true, now);
             self.factors_found = true;
         }
         if self.key_ordered {
@@ -981,7 +1008,7 @@ impl Measurement {
         if self.zero.is_running() {
             return Err(Refusal::Busy);
         }
-        let supply = self.mean_supply().ok_or(Refusal::SupplyUnknown)?;
+        let supply = self.supply.ok_or(Refusal::SupplyUnknown)?;
         let usable = self
             .reading
             .validity
@@ -1138,39 +1165,60 @@ impl Measurement {
         );
     }
 
-    /// A mean over some conversions of ADC1; a jump beyond [`SUPPLY_JUMP`] is taken at once.
+    /// A mean over some conversions of ADC1, which a jump beyond [`SUPPLY_JUMP`] begins anew.
     fn average_supply(
         &mut self,
         configuration: &Configuration,
         supply: Option<Microvolts>,
         now: Instant,
     ) {
-        self.supply_sum = supply.map(|supply| {
-            let new = i64::from(supply.get());
-            let follows = self
-                .supply_sum
-                .filter(|sum| ((sum >> SUPPLY_SHIFT) - new).abs() < i64::from(SUPPLY_JUMP.get()));
-            let sum = follows.map_or(new << SUPPLY_SHIFT, |sum| sum - (sum >> SUPPLY_SHIFT) + new);
-            if follows.is_none() {
-                // Converter and sensor are there before the meter's factors are.
-                self.compare.restart_at(meter_follows(now));
+        let mean = supply.map(|newest| self.supply_mean_with(newest));
+        self.supply = mean;
+        let used = self.prepared.supply;
+        let anew = if let (Some(newest), Some(mean), Some(used)) = (supply, mean, used) {
+            // Their relations have volts in them.
+            let at_zero = configuration.converter.supply_mode == SupplyMode::Measured
+                || matches!(configuration.front_end, FrontEnd::ClosedLoop(_));
+            let off = newest.saturating_sub(used).saturating_abs();
+            let off = if off < SUPPLY_DOUBT { 0 } else { off.get() };
+            let share = Ppm(off / SUPPLY_PPM);
+            self.compare
+                .on_supply(share, if at_zero { share } else { Ppm(0) });
+            if !is_beyond(mean, used, SUPPLY_STEP) {
+                return;
             }
-            sum
-        });
-        let mean = self.mean_supply();
-        let moved = match (mean, self.prepared.supply) {
-            (Some(new), Some(old)) => new.saturating_sub(old).saturating_abs() >= SUPPLY_STEP,
-            (new, old) => new.is_some() != old.is_some(),
+            if is_beyond(mean, used, SUPPLY_JUMP) {
+                self.converter.forget_meter_until(meter_follows(now));
+            }
+            false
+        } else {
+            if mean == used {
+                return;
+            }
+            true
         };
-        if moved {
-            self.prepare_again(configuration, self.key.factors(), mean, now);
-        }
+        let factors = self.key.factors();
+        self.prepare_again(configuration, factors, mean, anew, now);
     }
 
-    /// The supply by itself; the factors in use are of one up to [`SUPPLY_STEP`] beside it.
-    fn mean_supply(&self) -> Option<Microvolts> {
-        self.supply_sum
-            .map(|sum| Microvolts(clamp_i32(sum >> SUPPLY_SHIFT)))
+    fn supply_mean_with(&mut self, newest: Microvolts) -> Microvolts {
+        let before = core::mem::replace(&mut self.newest_supply, newest);
+        let Some(mean) = self.supply else {
+            return newest;
+        };
+        if !is_beyond(newest, mean, SUPPLY_JUMP) {
+            self.supply_jump = 0;
+        } else if is_beyond(newest, before, SUPPLY_JUMP) {
+            self.supply_jump = 1;
+        } else {
+            self.supply_jump = self.supply_jump.wrapping_add(1);
+            if self.supply_jump == SUPPLY_CONFIRMATIONS {
+                return newest;
+            }
+        }
+        // Up to 31 µV beside what does not move.
+        let off = newest.saturating_sub(mean).get() / SUPPLY_READINGS;
+        mean.saturating_add(Microvolts(off))
     }
 
     /// The meter's mean current while nothing speaks against it.
@@ -1433,7 +1481,7 @@ impl Measurement {
     #[must_use]
     pub fn environment(&self) -> can::Environment {
         let missing = self.environment_is_missing();
-        let supply = self.mean_supply().unwrap_or_default();
+        let supply = self.supply.unwrap_or_default();
         let validity =
             |is_there: bool| Validity::VALID.and_if(missing || !is_there, Validity::STALE);
         can::Environment {
@@ -1582,7 +1630,7 @@ impl Measurement {
         readings.pack_voltage = self.pack_voltage.unwrap_or_default();
         readings.cell_validity =
             Validity::VALID.and_if(self.cell_voltage_is_missing(), Validity::STALE);
-        readings.supply = self.mean_supply().unwrap_or_default();
+        readings.supply = self.supply.unwrap_or_default();
         readings.supply_validity = environment.supply_validity;
         readings.network_voltage = self.environment.network.unwrap_or_default();
         readings.mcu_supply = self.environment.controller_supply.unwrap_or_default();
@@ -1730,7 +1778,7 @@ mod tests {
         assert!(longest > Some(6_000), "{longest:?} ticks");
         // What the factors are off by, and the mean with its noise.
         assert!(used.saturating_sub(Microvolts(5_000_000)).saturating_abs() < Microvolts(5_000));
-        let mean = measurement.mean_supply().unwrap();
+        let mean = measurement.supply.unwrap();
         assert!(mean.saturating_sub(used).saturating_abs() < SUPPLY_STEP);
     }
 

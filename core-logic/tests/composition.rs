@@ -1138,7 +1138,7 @@ fn surroundings_are_sent_with_their_validity() {
     bench.environment.sensor_temperature = Some(MilliCelsius(-40_001));
     bench.run_ms(1_500);
     assert!(bench.has(Code::TemperatureOutOfRange));
-    // A supply that jumps is believed at once, one that wanders is averaged.
+    // A supply that jumps is believed at the third reading, one that wanders is averaged.
     bench.environment.supply = Some(Microvolts::from_millivolts(5_020));
     bench.run_ms(10);
     assert!(bench.measurement.environment().supply < Millivolts(5_005));
@@ -1150,8 +1150,17 @@ fn surroundings_are_sent_with_their_validity() {
         "{supply:?}"
     );
     bench.environment.supply = Some(Microvolts::from_millivolts(4_600));
+    bench.run_ms(20);
+    assert!(bench.measurement.environment().supply > Millivolts(4_990));
     bench.run_ms(10);
     assert_eq!(bench.measurement.environment().supply, Millivolts(4_600));
+    // One by itself counts for a 32nd.
+    bench.environment.supply = Some(Microvolts::from_millivolts(4_500));
+    bench.run_ms(10);
+    bench.environment.supply = Some(Microvolts::from_millivolts(4_600));
+    bench.run_ms(100);
+    let supply = bench.measurement.environment().supply;
+    assert!((Millivolts(4_597)..Millivolts(4_600)).contains(&supply));
 }
 
 #[test]

@@ -16,11 +16,12 @@ mod host_board;
 mod ideal_board;
 
 use core_logic::configuration::Configuration;
+use core_logic::converter::SupplyMode;
 use core_logic::diagnosis::{Code, CodeSet};
 use core_logic::error_budget::{ProfileSummary, charge_bound};
 use core_logic::front_end::KeyFactors;
 use core_logic::key_calibration::KeyPhase;
-use core_logic::measurement::{Measurement, Order, Refusal, Vehicle};
+use core_logic::measurement::{Measurement, Order, Refusal, Tick, Vehicle};
 use core_logic::meter::MeterReport;
 use core_logic::modbus::Readings;
 use core_logic::open_sensor::network_output_open;
@@ -358,15 +359,14 @@ fn a_bad_supply_is_reported_and_never_measured_with() {
     }
 }
 
-/// A real drive with 400 A peaks and ideal sensors: whatever is reported is a false alarm.
-#[test]
-fn a_real_drive_raises_no_diagnosis() {
+/// A real drive's current for so long, times 19: 400 A at its peaks.
+fn us06(seconds: f64) -> Vec<Row> {
     let path = concat!(
         env!("CARGO_MANIFEST_DIR"),
         "/../recordings/panasonic-18650pf/25c-us06.csv"
     );
     let mut reader = csv::Reader::from_path(path).unwrap();
-    let rows: Vec<Row> = reader
+    reader
         .records()
         .map(|record| {
             let record = record.unwrap();
@@ -377,8 +377,14 @@ fn a_real_drive_raises_no_diagnosis() {
                 cell_v: number(2),
             }
         })
-        .take_while(|row| row.t_s < 2_000.0)
-        .collect();
+        .take_while(|row| row.t_s < seconds)
+        .collect()
+}
+
+/// A real drive with 400 A peaks and ideal sensors: whatever is reported is a false alarm.
+#[test]
+fn a_real_drive_raises_no_diagnosis() {
+    let rows = us06(2_000.0);
     assert!(rows.len() > 19_000, "{}", rows.len());
     let mut board = board(&rows);
     let mut raised = Vec::new();
@@ -455,6 +461,112 @@ fn a_converter_that_repeats_itself_is_found_by_the_meter_beside_it() {
     board.stuck_code = Some(4_100);
     let after = raised_within_s(board, Code::ConverterStuck).unwrap();
     assert!(after <= 4.0, "{after} s");
+}
+
+/// A supply in V by the number of its reading.
+type Supply = Box<dyn Fn(u64) -> f64>;
+
+/// Supplies that pass 25 mV from their mean, and whether they move the factors by more than that: three readings in a row beyond it,
+/// which no outlier and no fast ripple has.
+fn supplies() -> Vec<(&'static str, bool, Supply)> {
+    let sine = |hertz: f64, amplitude_v: f64| -> Supply {
+        Box::new(move |reading| {
+            let turns = hertz * reading as f64 * 0.01;
+            5.0 + amplitude_v * (core::f64::consts::TAU * turns).sin()
+        })
+    };
+    let every = |nth: u64, other_v: f64| -> Supply {
+        Box::new(move |reading| if reading % nth == 0 { other_v } else { 5.0 })
+    };
+    let any = |reading: u64| {
+        let mixed = (reading + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40;
+        5.0 + 0.06 * (mixed as f64 / f64::from(1 << 23) - 1.0)
+    };
+    vec![
+        ("every other reading", false, every(2, 5.06)),
+        ("every fifth reading", false, every(5, 4.9)),
+        ("any", false, Box::new(any)),
+        ("41 Hz", false, sine(41.0, 0.06)),
+        ("11 Hz", true, sine(11.0, 0.06)),
+        ("3 Hz", true, sine(3.0, 0.1)),
+        ("1 Hz", true, sine(1.0, 0.1)),
+        ("0.3 Hz", true, sine(0.3, 0.1)),
+    ]
+}
+
+/// Runs with the meter's factors as late as they may be, and with a supply that moves between two readings.
+fn run_on_supply(
+    board: &mut HostBoard<'_>,
+    supply: &Supply,
+    mut each: impl FnMut(&mut HostBoard<'_>, Tick) -> bool,
+) {
+    board.meter_lag = 3;
+    while let Some(step) = board.step() {
+        let Step::Tick(tick) = step else { continue };
+        if each(board, tick) {
+            return;
+        }
+        board.world.supply_v = supply(board.now_us / 10_000);
+        board.supply = Some(Microvolts((board.world.supply_v * 1e6) as i32));
+    }
+}
+
+#[test]
+fn under_a_supply_that_moves_a_fault_is_found_all_the_same() {
+    let rows = triangle();
+    let fault_at_us = 13_000_000;
+    for (name, moves_factors, supply) in supplies() {
+        let found_s = |code: Code, inject: fn(&mut HostBoard<'_>)| {
+            let mut found_us = None;
+            let mut board = board(&rows);
+            run_on_supply(&mut board, &supply, |board, tick| {
+                if board.now_us >= fault_at_us {
+                    inject(board);
+                    found_us = tick.changes.set.contains(code).then_some(board.now_us);
+                }
+                found_us.is_some()
+            });
+            found_us.map(|us| (us - fault_at_us) as f64 * 1e-6)
+        };
+        let frozen = found_s(Code::MeterFrozen, |board| board.frozen = true);
+        assert!(frozen.is_some_and(|s| s <= 1.0), "{name}: {frozen:?}");
+        let stuck = found_s(Code::ConverterStuck, |board| board.stuck_code = Some(4_100));
+        // README, limits: a meter whose factors move says nothing of how its mean does.
+        assert!(
+            stuck.map_or(moves_factors, |s| s <= 4.0),
+            "{name}: {stuck:?}"
+        );
+        let missing = found_s(Code::ChannelsDisagree, |board| {
+            board.stuck_code = Some(4_096);
+        });
+        assert!(missing.is_some_and(|s| s <= 4.0), "{name}: {missing:?}");
+    }
+}
+
+#[test]
+fn a_supply_that_moves_is_no_fault_of_the_channels() {
+    let rows = us06(300.0);
+    for (name, _, supply) in supplies() {
+        for own_reference in [false, true] {
+            let mut configuration = Configuration::default();
+            if own_reference {
+                configuration.converter.supply_mode = SupplyMode::Measured;
+            }
+            let mut board = HostBoard::new(&rows, Timing::default(), configuration);
+            board.world.own_reference = own_reference;
+            run_on_supply(&mut board, &supply, |board, tick| {
+                let raised: Vec<_> = tick.changes.set.iter().collect();
+                // Nothing has anchored it, and the bus says so.
+                assert!(
+                    raised.is_empty() || raised == [Code::SocUncertain],
+                    "{name}, own reference {own_reference}, {} s: {raised:?} {:?}",
+                    board.world.elapsed_s(),
+                    board.measurement.compare_report()
+                );
+                false
+            });
+        }
+    }
 }
 
 /// What floats at 2.5 V behind the switch reads like 0 A: the other channel contradicts it.

@@ -4,13 +4,15 @@
 // Each user of this file needs another part of it.
 #![allow(dead_code)]
 
+use std::collections::VecDeque;
+
 use core_logic::can::{self, Frame};
 use core_logic::configuration::Configuration;
 use core_logic::converter::ConverterSample;
 use core_logic::diagnosis::CodeSet;
 use core_logic::gap::GapBridge;
 use core_logic::measurement::{Environment, Measurement, Tick, Vehicle};
-use core_logic::meter::{MeterChannel, MeterReading, ReadingOutcome, Rejection};
+use core_logic::meter::{MeterChannel, MeterConfig, MeterReading, ReadingOutcome, Rejection};
 use core_logic::open_sensor::network_output;
 use core_logic::range::EdgeRecorder;
 use core_logic::units::{Duration, Instant, Microvolts, MilliCelsius, Millivolts, Nanocoulombs};
@@ -26,7 +28,7 @@ pub struct HostBoard<'a> {
     pub meter: MeterChannel,
     pub measurement: Measurement,
     pub vehicle: Vehicle,
-    /// Supply of the sensors; the ideal sensors' output is referred to 5 V all the same.
+    /// What the sensors' supply reads as; what they run from is [`IdealBoard::supply_v`].
     pub supply: Option<Microvolts>,
     /// What the open-sensor channel shows instead of the small sensor's output.
     pub network: Option<Microvolts>,
@@ -35,6 +37,9 @@ pub struct HostBoard<'a> {
     pub stuck_code: Option<i16>,
     /// AENERGY stands still.
     pub frozen: bool,
+    /// So many ticks after the converter the meter counts by other factors; at most as long as the logic waits for it.
+    pub meter_lag: usize,
+    configs: VecDeque<MeterConfig>,
     /// The meter does not answer in this time, in µs.
     pub dead: core::ops::Range<u64>,
     /// As of the newest tick: what the meter's owner has when it needs it.
@@ -78,6 +83,8 @@ impl<'a> HostBoard<'a> {
             external: CodeSet::EMPTY,
             stuck_code: None,
             frozen: false,
+            meter_lag: 0,
+            configs: VecDeque::new(),
             dead: 0..0,
             bridge: GapBridge::UNKNOWN,
             energy: 0,
@@ -162,7 +169,9 @@ impl<'a> HostBoard<'a> {
     fn tick(&mut self, at_us: u64) -> Tick {
         let now = Instant::from_ticks(at_us);
         let history = self.edges.history(now);
-        let small_volts = 2.5 + 2.25 * (self.world.current_a() / 60.0).clamp(-1.0, 1.0);
+        let small_volts = (2.5 + 2.25 * (self.world.current_a() / 60.0).clamp(-1.0, 1.0))
+            * self.world.supply_v
+            / 5.0;
         let network = self
             .network
             .unwrap_or_else(|| network_output(Microvolts((small_volts * 1e6) as i32)));
@@ -199,8 +208,13 @@ impl<'a> HostBoard<'a> {
             found.store(&mut self.configuration);
             self.measurement.configuration_changed(&self.configuration);
         }
-        self.meter
-            .set_config(self.measurement.meter_config(&self.configuration));
+        self.configs
+            .push_back(self.measurement.meter_config(&self.configuration));
+        while self.configs.len() > self.meter_lag {
+            if let Some(config) = self.configs.pop_front() {
+                self.meter.set_config(config);
+            }
+        }
         self.bridge = self.measurement.bridge();
         tick
     }

@@ -14,6 +14,7 @@ fn counts_per_second() -> f64 {
     design::METER_COUNTS_PER_SECOND_Q32 as f64 / 2f64.powi(32)
 }
 
+const NOMINAL_SUPPLY_V: f64 = 5.0;
 const SMALL_A: f64 = 60.0;
 const LARGE_A: f64 = 600.0;
 /// Comparator threshold referred to the conductor and its hysteresis (20 mV at 37.5 mV/A).
@@ -77,7 +78,12 @@ pub struct IdealBoard<'a> {
     flag_high: bool,
     energy: f64,
     conversion_started: f64,
+    /// V·s
     conversion_integral: f64,
+    /// What the sensors run from: their outputs, and the level that the meter measures against, are shares of it.
+    pub supply_v: f64,
+    /// The converter measures against 5 V of its own, instead of against the sensors' supply.
+    pub own_reference: bool,
     next_tick: f64,
     next_poll: f64,
     snapshot_at: f64,
@@ -99,6 +105,8 @@ impl<'a> IdealBoard<'a> {
             energy: 0.0,
             conversion_started: t,
             conversion_integral: 0.0,
+            supply_v: NOMINAL_SUPPLY_V,
+            own_reference: false,
             next_tick: t,
             next_poll: t + timing.meter_poll_s,
             snapshot_at: f64::INFINITY,
@@ -201,8 +209,10 @@ impl<'a> IdealBoard<'a> {
                 0.5 * (self.share(a) + self.share(b)) * (w[1] - w[0]) * dt
             })
             .sum();
-        self.energy += counts_per_second() * integral;
-        self.conversion_integral += integral;
+        let ratio = self.supply_v / NOMINAL_SUPPLY_V;
+        self.energy += counts_per_second() * integral * ratio;
+        let ratio = if self.own_reference { ratio } else { 1.0 };
+        self.conversion_integral += (2.5 * dt + 2.25 * integral) * ratio;
         self.t = end;
     }
 
@@ -260,7 +270,7 @@ impl<'a> IdealBoard<'a> {
                 });
             }
             if stop == conversion_end {
-                let volts = 2.5 + 2.25 * self.conversion_integral / self.timing.conversion_s;
+                let volts = self.conversion_integral / self.timing.conversion_s;
                 let started_us =
                     ((self.conversion_started - self.rows[0].t_s) * 1e6).round() as u64;
                 self.conversion_started = self.t;
