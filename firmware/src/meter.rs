@@ -15,7 +15,7 @@ use core_logic::{
     gap::GapBridge,
     meter::{MeterChannel, MeterReading, MeterReport, ReadingOutcome, Rejection},
     range::RangeHistory,
-    units::{Duration, Instant, MilliCelsius, clamp_i32, div_round, elapsed},
+    units::{Duration, Instant, MilliCelsius, elapsed},
 };
 use stm32f4xx_hal::{
     gpio::{Output, PA4},
@@ -43,11 +43,6 @@ const RETRY: Duration = Duration::from_ticks(40_000);
 /// that chatter of any frequency takes no more than a tenth of the time.
 const SNAPSHOTS: u8 = 4;
 const SNAPSHOT_WINDOW: Duration = Duration::from_ticks(2_000);
-
-/// The temperature sensor's code 0, and kelvins per code as a fraction: 1.5 codes a kelvin (ADE7753 Rev C, temperature
-/// measurement; the offset has to be calibrated for more than a rough value).
-const TEMPERATURE_AT_CODE_0: MilliCelsius = MilliCelsius(-25_000);
-const TEMPERATURE_STEP: (i64, i64) = (2, 3);
 
 type Chip = Ade7753<spi::Device<SPI1, PA4<Output>>>;
 
@@ -399,12 +394,8 @@ impl Meter {
         if self.converting || !core::mem::take(&mut self.temperature_asked) {
             return None;
         }
-        let Temp(code) = self.chip.read::<Temp>().ok()?;
-        let above = div_round(
-            i64::from(code) * 1_000 * TEMPERATURE_STEP.0,
-            TEMPERATURE_STEP.1,
-        );
-        Some(TEMPERATURE_AT_CODE_0.saturating_add(MilliCelsius(clamp_i32(above))))
+        let code = self.chip.read::<Temp>().ok()?;
+        Some(MilliCelsius(code.rated_millicelsius()))
     }
 
     /// Whether readings make sense.

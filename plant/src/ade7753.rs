@@ -801,9 +801,9 @@ impl Ade7753 {
             self.temperature_done = None;
             self.temperature_pending = false;
             self.registers[usize::from(address::MODE)] &= !mode::TEMPSEL;
-            // Rev C, temperature measurement: 1.5 LSB/K, code 0 at −25 °C.
+            // Rev C, temperature measurement: 1.5 LSB/K, code 0 at −25 °C. It rolls over (sister part ADE7758, Rev. E).
             let code = 1.5 * (self.temperature_c + 25.0) + self.config.temperature_offset_codes;
-            self.temperature_code = (code.round() as i8).cast_unsigned().into();
+            self.temperature_code = (code.round() as i64 as u8).into();
             self.status |= flag::TEMP;
         }
     }

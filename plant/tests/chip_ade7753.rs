@@ -1280,6 +1280,15 @@ fn our_driver_keeps_every_time_and_reads_what_the_chip_has() {
     driver.start_temperature().unwrap();
     bench.borrow_mut().wait(30e-6);
     assert_eq!(driver.temperature().unwrap(), Some(Temp(75)));
+    // Over the chip's range, half a code beside it: TEMP rolls over at 60 °C.
+    for celsius in [-40.0, 0.0, 59.0, 60.0, 61.0, 85.0, 25.0] {
+        bench.borrow_mut().chip.set_temperature_c(celsius);
+        driver.start_temperature().unwrap();
+        bench.borrow_mut().wait(30e-6);
+        let read = driver.temperature().unwrap().unwrap().rated_millicelsius();
+        let error = f64::from(read) * 1e-3 - celsius;
+        assert!(error.abs() < 0.34, "{celsius} °C: {error} K");
+    }
 
     bench.borrow_mut().chip.brown_out(0.0);
     bench.borrow_mut().wait(1e-3);

@@ -397,6 +397,22 @@ numbers! {
     Dierev(u8), 8, unsigned, read, None;
 }
 
+impl Temp {
+    /// The temperature in m°C by the rated offset and scale: code 0 at −25 °C, 1.5 codes a kelvin (Rev C, temperature
+    /// measurement). The offset has to be calibrated for more than a rough value.
+    ///
+    /// Eight bits hold 170.7 K and roll over, at 60.3 °C (the sheet of the sister part ADE7758, Rev. E, says so and leaves it to
+    /// the master). Of the temperatures that a code stands for this is the one between −62.3 and +107.7 °C, around the chip's
+    /// own range of −40 … +85 °C.
+    #[must_use]
+    pub const fn rated_millicelsius(self) -> i32 {
+        const LOWEST: i8 = -56;
+        let above_lowest = self.0.wrapping_sub(LOWEST).cast_unsigned();
+        let code = above_lowest as i32 + LOWEST as i32;
+        code * 2_000 / 3 - 25_000
+    }
+}
+
 /// Readable registers with named fields, which `bits` knows.
 macro_rules! fields {
     ($($name:ident, $bits:literal, $reset:literal;)*) => {$(
