@@ -23,8 +23,8 @@ use crate::{
     problem::Problem,
     progress::Progress,
     report::{
-        data::{self, Report},
-        format::quantity,
+        data::{self, EffectReport, ParameterReport, Report, Verdict},
+        format::{quantity, with_interval},
         html, json, text,
     },
 };
@@ -175,6 +175,7 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
     });
     drop(explaining);
     remarks.append(&mut report.remarks);
+    remarks.extend(stated(&problems, report.verdict));
     report.remarks = remarks;
     report.inputs = data::Inputs {
         model: arguments.model.display().to_string(),
@@ -397,16 +398,66 @@ fn acts_elsewhere(report: &Report) -> Vec<String> {
             .iter()
             .filter(|other| other.of_battery == own.of_battery)
             .map(|other| other.signal.as_str())
-            .filter(|other| other != signal && !has_it(other))
+            .filter(|other| other != signal && !has_it(other) && !(*other == "soc_pct" && registry::of_voltage(id)))
             .collect();
         (!others.is_empty()).then(|| {
             let others = others.join(" and ");
             format!(
-                "{id} was found in {signal} and not in {others}; [effects.{id}] in model.toml acts in both: for {others} leave it out there"
+                "{id} was found in {signal} and not in {others}; [effects.{id}] in model.toml acts there too: for {others} leave it out"
             )
         })
     });
-    told.collect()
+    told.chain(contradictions(report)).collect()
+}
+
+/// Effects that two signals of one sensor, or of one battery, have with values that contradict each other: the model file has those of
+/// the first alone.
+fn contradictions(report: &Report) -> impl Iterator<Item = String> {
+    let of_battery = |signal: &str| {
+        let model = report.models.iter().find(|model| model.signal == signal);
+        model.map(|model| model.of_battery)
+    };
+    report.effects.iter().enumerate().filter_map(move |(at, other)| {
+        let side = of_battery(&other.signal)?;
+        let first = report.effects[..at]
+            .iter()
+            .find(|first| first.id == other.id && of_battery(&first.signal) == Some(side))?;
+        let apart = first
+            .parameters
+            .iter()
+            .zip(&other.parameters)
+            .find(|(one, two)| one.ci95[1] < two.ci95[0] || two.ci95[1] < one.ci95[0])?;
+        let shown = |effect: &EffectReport, parameter: &ParameterReport| {
+            let [value, _, _] = with_interval(parameter.value, parameter.ci95);
+            format!("{} in {}", quantity(&value, &parameter.unit), effect.signal)
+        };
+        Some(format!(
+            "{}: {} is {} and {}; model.toml has the values of {} for both: simulate the other with a model file of its own",
+            other.id,
+            apart.0.name,
+            shown(first, apart.0),
+            shown(other, apart.1),
+            first.signal
+        ))
+    })
+}
+
+/// Effects that the model file states are part of the simulation: said where something is left, for their size may have changed.
+fn stated(problems: &[Problem], verdict: Verdict) -> Option<String> {
+    let mut ids: Vec<&str> = Vec::new();
+    for (id, _) in problems.iter().flat_map(|problem| &problem.modelled) {
+        if !ids.contains(id) {
+            ids.push(id);
+        }
+    }
+    let tables: Vec<String> = ids.iter().map(|id| format!("[effects.{id}]")).collect();
+    (verdict != Verdict::NoMismatch && !tables.is_empty()).then(|| {
+        format!(
+            "stated in the model file and kept as it is there, not looked for again: {}; where its size may have changed, take it out of the \
+             model file",
+            tables.join(", ")
+        )
+    })
 }
 
 /// The model file with what was found.

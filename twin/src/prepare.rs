@@ -682,12 +682,14 @@ impl<'a> Work<'a> {
         Ok(())
     }
 
-    /// Environment columns, from the drive's own file or else from the other one.
+    /// Environment columns, from the drive's own file or else from the other one. Rows without a reference count too: a bus has a
+    /// message of its own for a temperature.
     fn surroundings(&self, drive: &mut Drive, rows: &[usize]) {
         let held = |name: &str| {
             if let Some(values) = self.drive_frame().column(name) {
-                let values = rows.iter().map(|row| values[*row]);
-                return series::held_over_gaps(values).map(Series::from);
+                let held = series::held_over_gaps(values.iter().copied())?;
+                let held: Vec<f64> = rows.iter().map(|row| held[*row]).collect();
+                return Some(Series::from(held));
             }
             let clock = self.clock.as_ref()?;
             let values = self.frame.column(name)?;

@@ -137,6 +137,94 @@ fn nothing_is_filled_in_but_the_surroundings() {
     assert_eq!(temperature[13], 21.3);
 }
 
+/// As a bus has them: a message of its own for the temperature, in rows without a reference.
+#[test]
+fn surroundings_in_rows_of_their_own_are_held() {
+    let (mut rows, mut after_message) = (Vec::new(), Vec::new());
+    let mut temperature = 20.0;
+    for k in 0..200 {
+        let t = f64::from(k) * 0.1;
+        if k % 10 == 5 {
+            temperature = 20.0 + t;
+            rows.push(vec![t - 0.01, f64::NAN, f64::NAN, temperature]);
+        }
+        rows.push(vec![t, current(t), current(t), f64::NAN]);
+        after_message.push(if k < 5 { 20.5 } else { temperature });
+    }
+    let (problem, _) = one(
+        PAIR,
+        &text("t_s,i_ref_a,i_meas_a,temp_sensor_c", rows.into_iter()),
+    );
+    assert_eq!(problem.drive.len(), 200);
+    let held = problem.drive.sensor_temperature_c.unwrap();
+    assert_eq!(held.to_vec(), after_message);
+}
+
+/// Two loggers of one make call their columns alike: the reference's name is the reference's.
+#[test]
+fn a_reference_whose_column_is_called_as_the_recordings_can_be_mapped() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let rows = |from: u32, size: f64| {
+        text(
+            "t_s,Current",
+            (from..3_000).map(move |k| {
+                let t = f64::from(k) * 0.1;
+                vec![t, size * current(t)]
+            }),
+        )
+    };
+    fs::write(folder.join("r.csv"), rows(0, 1.1)).unwrap();
+    fs::write(folder.join("shunt.csv"), rows(5, 1.0)).unwrap();
+    let model = Model::parse("m.toml", PAIR.to_owned(), folder).unwrap();
+    let inputs = Inputs {
+        recording: folder.join("r.csv"),
+        reference: Some(folder.join("shunt.csv")),
+        mapping: vec!["i_meas_a=Current".into(), "i_ref_a=Current".into()],
+    };
+    let prepared = prepare(&model, &inputs, Purpose::Compare).unwrap();
+    let problem = &prepared.items[0].problem;
+    assert_eq!(problem.drive.len(), 2_995);
+    let ratio = |values: &[f64]| values.iter().map(|value| value.abs()).fold(0.0, f64::max);
+    let seen = ratio(&problem.observed.value) / ratio(&problem.drive.reference);
+    assert!((seen - 1.1).abs() < 0.01, "{seen}");
+}
+
+/// A counter that a bus sends in a message of its own tells nothing at the current's rows, and that is said.
+#[test]
+fn a_testers_counter_in_rows_of_its_own_is_remarked() {
+    let model =
+        "schema = 1\n[battery]\ncapacity_ah = 3\ninitial_soc = 0.9\nocv = [[0, 3], [1, 4]]\n";
+    for own_rows in [false, true] {
+        let mut ah = 0.0;
+        let rows = (0..2_000).flat_map(|k| {
+            let t = f64::from(k);
+            let current = current(0.1 * t);
+            ah += current / 3_600.0;
+            let volts = 3.9 - 0.3 * ah;
+            if own_rows {
+                vec![
+                    vec![t, current, volts, f64::NAN],
+                    vec![t + 0.5, f64::NAN, f64::NAN, ah],
+                ]
+            } else {
+                vec![vec![t, current, volts, ah]]
+            }
+        });
+        let rows: Vec<_> = rows.collect();
+        let (_, remarks) = one(
+            model,
+            &text("t_s,i_ref_a,v_cell_v,ah_meas_ah", rows.into_iter()),
+        );
+        let told = remarks.join("; ");
+        assert_eq!(
+            told.contains("ah_meas_ah: 0 of its 2000 readings are in rows with i_ref_a"),
+            own_rows,
+            "{told}"
+        );
+    }
+}
+
 #[test]
 fn a_gap_begins_a_stretch_and_a_slow_rest_does_not() {
     // 0.1 s, a gap of 60 s, 0.1 s, a rest at 10 s a row, 0.1 s.

@@ -662,6 +662,42 @@ fn a_counters_step_can_be_left_out() {
     }
 }
 
+/// Where the reference holds its values, as a cycler's with rare rows in its rests, a counter without effects is that of the recording;
+/// so it is where the columns' names do not tell the unit.
+#[test]
+fn a_counter_of_a_held_reference_counts_what_was_held() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut t_s, mut charge_c) = (0.0, 0.0);
+    let mut rows = Vec::new();
+    for _ in 0..40 {
+        // A rest of one row, and a load of 89 s.
+        for (current_a, length_s, count) in [(0.0, 60.0, 1), (100.0, 1.0, 89)] {
+            for _ in 0..count {
+                rows.push((t_s, current_a, charge_c));
+                t_s += length_s;
+                charge_c += current_a * length_s;
+            }
+        }
+    }
+    for (reference, measured) in [("i_ref_a", "i_meas_a"), ("shunt", "hall")] {
+        let mut recording = format!("t_s,{reference},{measured},q_meas_c\n");
+        for (t_s, current_a, charge_c) in &rows {
+            recording.push_str(&format!("{t_s},{current_a},{current_a},{charge_c}\n"));
+        }
+        let model = format!(
+            "schema = 1\n[sensor]\nreference = \"{reference}\"\nmeasured = \"{measured}\"\nheld_reference = true\n[charge]\n"
+        );
+        let (model, prepared) = prepared(folder.path(), &model, &recording, Purpose::Simulate);
+        let written = columns(&model, &prepared, Readings::Stepped);
+        let counted = written.iter().find(|(name, _)| name == "q_meas_c");
+        let counted = &counted.unwrap().1;
+        assert_eq!(counted.len(), rows.len());
+        for (counted, (t_s, _, charge_c)) in counted.iter().zip(&rows) {
+            assert!((counted - charge_c).abs() < 1e-6, "{t_s} s: {counted} C");
+        }
+    }
+}
+
 /// A board's readings are codes, with and without `--no-step`; that is said, and of no other sensor.
 #[test]
 fn that_a_boards_codes_stay_is_said() {

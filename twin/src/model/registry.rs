@@ -23,6 +23,11 @@ pub fn ids() -> Vec<&'static str> {
     crate::effects::ids()
 }
 
+/// Whether it changes a battery's voltage alone, and not its charge.
+pub fn of_voltage(id: &str) -> bool {
+    all(id).any(|effect| effect.card().stage > Stage::BatteryCharge)
+}
+
 /// Whether it acts on the battery and not on the sensing chain.
 pub fn of_battery(id: &str) -> bool {
     all(id).any(|effect| effect.card().stage >= Stage::BatteryCharge)

@@ -86,8 +86,17 @@ pub(super) fn items(work: &mut Work<'_>, battery: &Battery) -> Result<Vec<Item>,
         drive.hold(holds);
     }
     let counter_ah = work.drive_frame().column(COUNTER);
+    let read = |ah: &[f64]| ah.iter().filter(|value| value.is_finite()).count();
+    let all_read = counter_ah.map_or(0, read);
     let counter_ah: Option<Vec<f64>> =
         counter_ah.map(|ah| parts.rows.iter().map(|row| ah[*row]).collect());
+    let beside_current = counter_ah.as_deref().map_or(0, read);
+    if 2 * beside_current < all_read {
+        work.remark(format!(
+            "{COUNTER}: {beside_current} of its {all_read} readings are in rows with {current}: the others do not tell the charge between \
+             rows and over gaps"
+        ));
+    }
     let told = counter_ah.as_deref();
     if let Some(told) = told.and_then(|ah| counter::between_rows(&drive, ah)) {
         work.remark(told.remark);

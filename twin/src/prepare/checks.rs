@@ -278,7 +278,7 @@ pub(super) fn enough(problem: &Problem, source: &str) -> Result<(), Failure> {
 }
 
 /// A time without the digits that a sum of steps leaves behind.
-fn shown(t_s: f64) -> f64 {
+pub(super) fn shown(t_s: f64) -> f64 {
     (t_s * 1e6).round() / 1e6
 }
 

@@ -208,9 +208,10 @@ pub(super) fn read(model: &Model, inputs: &Inputs) -> Result<(Frame, Option<Fram
         check(&frame)?;
         return Ok((frame, None));
     };
-    // Each name belongs to the file that has its column; to the recording if both do.
+    // Each name belongs to the file that has its column; if both do, the reference's to the reference and others to the recording.
     let (to_reference, rest): (Vec<_>, Vec<_>) = wanted.into_iter().partition(|(name, column)| {
-        name != "t_s" && has(&reference, column) && !has(&recording, column)
+        let is_reference = PAIRS.iter().any(|(reference, _)| name == reference);
+        name != "t_s" && has(&reference, column) && (is_reference || !has(&recording, column))
     });
     let time: Vec<_> = rest
         .iter()

@@ -5,7 +5,9 @@
 //! placebos. It is known by standing alone: the readings before and after agree, it is far from both, and the current does not move
 //! as much around it, so that no time, memory or filter of a sensor could have made it of the current.
 
-use super::series::quantile;
+use recording::error::number;
+
+use super::{checks::shown, series::quantile};
 use crate::{
     effects::{
         chain::{Chain, Nuisance},
@@ -47,7 +49,7 @@ pub(super) fn leave_out(problem: &mut Problem) -> Option<String> {
         problem.name,
         at_most(worst, 3),
         problem.unit,
-        at_most(at_s, 6),
+        number(shown(at_s)),
     ))
 }
 

@@ -123,6 +123,17 @@ pub fn p_value(p: f64) -> String {
     }
 }
 
+/// The ends of a stretch, with four digits; to a hundredth of it where four are coarser: of times since 1970 they are all the same.
+fn ends(from: f64, to: f64) -> [String; 2] {
+    let power_of_ten = |value: f64| value.log10().floor() as i32;
+    let (stretch, size) = (to - from, from.abs().max(to.abs()));
+    if !(stretch > 0.0 && 10f64.powi(power_of_ten(size) - 3) > 0.01 * stretch) {
+        return [from, to].map(|end| at_most(end, 4));
+    }
+    let decimals = (2 - power_of_ten(stretch)).max(0) as usize;
+    [from, to].map(|end| minus(format!("{end:.decimals$}")))
+}
+
 /// Where a location is: `abs(i) > 48 A`.
 pub fn place(location: &Location) -> String {
     let variable = match (location.kind, location.variable.as_str()) {
@@ -139,7 +150,10 @@ pub fn place(location: &Location) -> String {
         (Some(1.0), None) if flag => format!("{variable} = 1"),
         (None, Some(0.0)) if flag => format!("{variable} = 0"),
         (Some(from), Some(to)) if from == to => format!("{variable} = {}", end(from)),
-        (Some(from), Some(to)) => format!("{variable} {} … {}", at_most(from, 4), end(to)),
+        (Some(from), Some(to)) => {
+            let [from, to] = ends(from, to);
+            format!("{variable} {from} … {}", quantity(&to, &location.unit))
+        }
         (Some(from), None) => format!("{variable} > {}", end(from)),
         // A size is never below 0.
         (None, Some(to)) if to <= 0.0 && variable.starts_with("abs(") => {
@@ -268,6 +282,30 @@ mod tests {
             with_interval(2.0, [f64::NEG_INFINITY, 5.0]),
             ["2.000", NONE, "5.000"]
         );
+    }
+
+    #[test]
+    fn a_stretch_of_times_since_1970_can_be_found() {
+        let at = |from: f64, to: f64| {
+            place(&Location {
+                signal: "i_meas_a".to_owned(),
+                kind: LocationKind::Time,
+                variable: "t_s".to_owned(),
+                unit: "s".to_owned(),
+                from: Some(from),
+                to: Some(to),
+                energy_share: 1.0,
+                sample_share: 0.5,
+                p_value: 0.01,
+                effect: None,
+            })
+        };
+        assert_eq!(
+            at(1_717_430_477.7, 1_717_430_512.3),
+            "time 1717430477.7 … 1717430512.3 s"
+        );
+        assert_eq!(at(1_200.0, 1_300.0), "time 1200 … 1300 s");
+        assert_eq!(at(12.345_67, 80.0), "time 12.35 … 80 s");
     }
 
     #[test]

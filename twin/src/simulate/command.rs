@@ -182,7 +182,8 @@ fn counter(model: &Model, prepared: &Prepared, readings: Readings) -> Option<Vec
         .find(|item| item.problem.view == View::Sensor)?;
     let sensor = model.sensor.as_ref()?;
     let problem = &item.problem;
-    if problem.unit != "A" {
+    // A pair of columns whose names do not tell the unit is of a current where it has a counter of charge.
+    if !matches!(problem.unit.as_str(), "A" | "1") {
         return None;
     }
     if let Some(board) = Board::new(sensor.front_end, sensor.average.unwrap_or(1)) {
@@ -210,15 +211,20 @@ fn counter(model: &Model, prepared: &Prepared, readings: Readings) -> Option<Vec
     Some(counted)
 }
 
-/// Charge of a current, in A, at the observed rows: straight lines between them, nothing over gaps.
+/// Charge of a current, in A, at the observed rows: straight lines between them, or held where the reference is; nothing over gaps.
 fn integral_c(problem: &Problem, current_a: &[f64]) -> Vec<f64> {
     let observed = &problem.observed;
+    let held = matches!(&problem.base, Base::Sensor(base) if base.held_reference);
     let mut sum = 0.0;
     (0..current_a.len())
         .map(|row| {
             if row > 0 && observed.segment_of(row) == observed.segment_of(row - 1) {
                 let h = observed.t_s[row] - observed.t_s[row - 1];
-                let mean = 0.5 * (current_a[row] + current_a[row - 1]);
+                let mean = if held {
+                    current_a[row - 1]
+                } else {
+                    0.5 * (current_a[row] + current_a[row - 1])
+                };
                 if mean.is_finite() {
                     sum += mean * h;
                 }
