@@ -319,13 +319,8 @@ fn a_recording_comes_through_a_pipe_as_from_a_file() {
     }
 }
 
-/// A counter with a zero of its own: the model file has one offset for the sensor and its counter, and that is said.
-#[test]
-fn an_effect_of_the_counter_alone_is_said_to_act_in_the_sensor_too() {
-    let folder = tempfile::tempdir().unwrap();
-    let folder = folder.path();
-    let model = "schema = 1\n[sensor]\nfront_end = \"pair\"\nheld_reference = true\nnoise = 0.2\n[charge]\nstep_c = 0.01\n";
-    fs::write(folder.join("m.toml"), model).unwrap();
+/// Rows of a sensor whose reading and counter have zeros of their own.
+fn zeros_of_their_own(reading_a: f64, counter_a: f64) -> String {
     let mut random = ChaCha8Rng::seed_from_u64(5);
     let mut uniform = move || f64::from(random.next_u32()) / f64::from(u32::MAX);
     let mut text = "t_s,i_ref_a,i_meas_a,q_meas_c\n".to_owned();
@@ -338,24 +333,65 @@ fn an_effect_of_the_counter_alone_is_said_to_act_in_the_sensor_too() {
         text.push_str(&format!(
             "{:.1},{current},{},{:.2}\n",
             f64::from(k) * 0.1,
-            current + noise,
+            current + reading_a + noise,
             counted
         ));
-        counted += (current + 0.5) * 0.1;
+        counted += (current + counter_a) * 0.1;
     }
-    fs::write(folder.join("r.csv"), text).unwrap();
-    assert_eq!(explained(folder, &[]).status.code(), Some(0));
+    text
+}
+
+fn found(folder: &Path) -> (Vec<(String, String)>, String) {
     let report = fs::read_to_string(folder.join("out/report.json")).unwrap();
     let report: serde_json::Value = serde_json::from_str(&report).unwrap();
+    let text = |value: &serde_json::Value| value.as_str().unwrap().to_owned();
     let effects = report["effects"].as_array().unwrap();
-    assert_eq!(effects.len(), 1, "{effects:?}");
-    assert_eq!(
-        (effects[0]["id"].as_str(), effects[0]["signal"].as_str()),
-        (Some("offset"), Some("q_meas_c"))
-    );
-    let remarks = report["remarks"].to_string();
+    let effects = effects
+        .iter()
+        .map(|effect| (text(&effect["id"]), text(&effect["signal"])))
+        .collect();
+    (effects, report["remarks"].to_string())
+}
+
+const ZERO_MODEL: &str = "schema = 1\n[sensor]\nfront_end = \"pair\"\nheld_reference = true\nnoise = 0.2\n[charge]\nstep_c = 0.01\n";
+
+/// A counter with a zero of its own: the model file has one offset for the sensor and its counter, and that is said.
+#[test]
+fn an_effect_of_the_counter_alone_is_said_to_act_in_the_sensor_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    fs::write(folder.join("m.toml"), ZERO_MODEL).unwrap();
+    fs::write(folder.join("r.csv"), zeros_of_their_own(0.0, 0.5)).unwrap();
+    assert_eq!(explained(folder, &[]).status.code(), Some(0));
+    let (effects, remarks) = found(folder);
+    assert_eq!(effects, [("offset".into(), "q_meas_c".into())]);
     assert!(
         remarks.contains("offset was found in q_meas_c and not in i_meas_a"),
+        "{remarks}"
+    );
+    assert!(!remarks.contains("stated in the model file"), "{remarks}");
+}
+
+/// Two zeros that contradict each other: the model file has one of them, which is said; and with that file, that it is not looked for.
+#[test]
+fn two_zeros_of_one_sensor_are_said_to_contradict_each_other() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    fs::write(folder.join("m.toml"), ZERO_MODEL).unwrap();
+    fs::write(folder.join("r.csv"), zeros_of_their_own(-0.3, 0.5)).unwrap();
+    assert_eq!(explained(folder, &[]).status.code(), Some(0));
+    let (effects, remarks) = found(folder);
+    assert_eq!(effects.len(), 2, "{effects:?}");
+    assert!(
+        remarks.contains("model.toml has the values of i_meas_a for both"),
+        "{remarks}"
+    );
+    fs::copy(folder.join("out/model.toml"), folder.join("m.toml")).unwrap();
+    assert_eq!(explained(folder, &[]).status.code(), Some(0));
+    let (effects, remarks) = found(folder);
+    assert!(effects.iter().all(|(id, _)| id != "offset"), "{effects:?}");
+    assert!(
+        remarks.contains("not looked for again: [effects.offset]"),
         "{remarks}"
     );
 }
