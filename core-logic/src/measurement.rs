@@ -933,7 +933,8 @@ impl Measurement {
     ) -> Result<CommandState, Refusal> {
         match order {
             Order::ZeroNow => {
-                if self.sweep.is_some() {
+                // What is found and not yet in force would be taken off once more, or undone.
+                if self.sweep.is_some() || self.found.is_some() {
                     return Err(Refusal::Busy);
                 }
                 let conditions = self.zero_conditions();

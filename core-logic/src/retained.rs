@@ -290,8 +290,7 @@ pub struct SavePolicyConfig {
 }
 
 impl Default for SavePolicyConfig {
-    /// 360 As is 0.1 Ah, 0.04 % of D4's 240 Ah: 2,400 records for a full discharge, so that a log of 2 MiB is erased
-    /// once in ten full cycles.
+    /// 360 As is 0.1 Ah, 0.04 % of D4's 240 Ah: 2,400 records for a full discharge.
     fn default() -> Self {
         Self {
             charge_interval: Nanocoulombs::from_coulombs(360),
