@@ -369,8 +369,7 @@ mod app {
         }
         cx.shared.meter_link.lock(|link| link.in_self_test = false);
         pace::until(next_poll).await;
-        let mut polls = 0_u32;
-        let mut next_temperature = 0;
+        let mut polls_to_temperature = 0_u32;
         let (mut edge, mut interrupt, mut verify, mut poll) = (false, false, true, true);
         let (mut convert, mut fetch) = (false, false);
         let mut edge_at = None;
@@ -413,10 +412,10 @@ mod app {
                 verify = false;
                 let mode_is_right = meter.verify(now);
                 // Only right after MODE was seen to be right: the write would hide that a reset has cleared it.
-                convert = mode_is_right && polls >= next_temperature;
+                convert = mode_is_right && polls_to_temperature == 0;
             } else if convert {
                 convert = false;
-                next_temperature = polls.saturating_add(TEMPERATURE_EVERY_POLLS);
+                polls_to_temperature = TEMPERATURE_EVERY_POLLS;
                 meter.start_temperature();
             } else if fetch && !poll {
                 fetch = false;
@@ -426,8 +425,8 @@ mod app {
                     .lock(|link| link.temperature = temperature);
             } else if poll {
                 poll = false;
-                polls = polls.saturating_add(1);
-                fetch = polls.saturating_add(TEMPERATURE_AFTER_POLLS) == next_temperature;
+                polls_to_temperature = polls_to_temperature.saturating_sub(1);
+                fetch = polls_to_temperature == TEMPERATURE_AFTER_POLLS;
                 if meter.is_counting() {
                     waits = meter.snapshot(
                         |at| cx.shared.edges.lock(|edges| edges.history(at)),
