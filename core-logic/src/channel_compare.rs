@@ -208,8 +208,8 @@ struct SupplyDoubt {
     readings: u8,
 }
 
-/// The longest conversion, at 8 samples a second, may have begun before the supply moved, and the meter follows in 50 ms: by
-/// readings of 10 ms.
+/// The longest conversion, at 8 samples a second, may have begun before the supply moved, and the meter follows in 50 ms:
+/// (125 + 50) ms / 10 ms between two readings, rounded up.
 const SUPPLY_DOUBT_READINGS: u8 = 18;
 
 /// A meter that stands still, from the report that showed its last count on.
@@ -473,9 +473,9 @@ impl ChannelCompare {
         self.restart(true);
     }
 
-    /// The newest reading of the sensor's supply is off by `share` from what the channels take it for. The bound is wider by that, or
-    /// by a larger one before it, until both have the same; by `share_at_zero` of the sensor's output at 0 A where one of them has that
-    /// from it too.
+    /// The newest reading of the sensor's supply is off by `share` from what the channels take it for; 0 within its noise. The bound is
+    /// wider by the largest of `SUPPLY_DOUBT_READINGS`; and by `share_at_zero` of the sensor's output at 0 A, where a channel has
+    /// that from the supply too.
     pub fn on_supply(&mut self, share: Ppm, share_at_zero: Ppm) {
         let doubt = &mut self.supply_doubt;
         if share >= doubt.share || doubt.readings == 0 {

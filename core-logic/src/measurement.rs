@@ -232,12 +232,12 @@ const SUPPLY_CONFIRMATIONS: u8 = 3;
 /// A reading further than this from what the factors are of widens what the channels may differ by. Twice the 0.1 % that the
 /// tolerances have in them, 2.7 times the rms noise of one reading.
 const SUPPLY_DOUBT: Microvolts = Microvolts::from_millivolts(10);
-/// 1 ppm of the lowest supply in µV, rounded down.
-const SUPPLY_PPM: i32 = design::SENSOR_SUPPLY_LOW.get() / 1_000_000;
 const _: () = assert!(
     SUPPLY_DOUBT.get() as i64 * 1_000_000
         == 2 * design::SUPPLY_RESIDUAL.get() as i64 * design::SENSOR_NOMINAL_SUPPLY.get() as i64
 );
+/// 1 ppm of the lowest supply in µV, rounded down: a difference in µV by it is a share in ppm, or more.
+const SUPPLY_PPM: i32 = design::SENSOR_SUPPLY_LOW.get() / 1_000_000;
 /// By then the meter counts with the factors that it is handed: a tick and a poll.
 const METER_FOLLOWS: Duration = Duration::from_ticks(50_000);
 /// Environment readings older than this are missing.
@@ -311,6 +311,7 @@ pub struct Measurement {
     supply: Option<Microvolts>,
     /// Readings in a row that say that the supply has jumped.
     supply_jump: u8,
+    /// The reading that the next one is compared with.
     newest_supply: Microvolts,
     cell_voltage: Option<CellVoltage>,
     pack_voltage: Option<Millivolts>,
@@ -624,8 +625,8 @@ impl Measurement {
         true
     }
 
-    /// Other factors, in the converter at once and in the meter a little later: unless they differ by the supply alone, what was
-    /// compared by those before says nothing.
+    /// Other factors, in the converter at once and in the meter a little later. `anew`: what was compared by those before says nothing;
+    /// not so where they differ by the supply alone.
     fn prepare_again(
         &mut self,
         configuration: &Configuration,
@@ -1177,7 +1178,7 @@ impl Measurement {
         self.supply = mean;
         let used = self.prepared.supply;
         let anew = if let (Some(newest), Some(mean), Some(used)) = (supply, mean, used) {
-            // Their relations have volts in them.
+            // The one divides volts by the supply, the other's relations have volts in them.
             let at_zero = configuration.converter.supply_mode == SupplyMode::Measured
                 || matches!(configuration.front_end, FrontEnd::ClosedLoop(_));
             let off = newest.saturating_sub(used).saturating_abs();

@@ -681,15 +681,21 @@ fn an_ordered_key_calibration_ends_as_done_or_failed() {
     assert_eq!(state(&bench), (CommandState::Failed, 3));
 }
 
-/// A run that began before the result of the one before is in force would take it off once more, or undo it.
-#[test]
-fn a_zero_calibration_waits_until_the_result_before_is_in_force() {
+/// A zero drift of 1 A is found, and nobody has taken it.
+fn with_zero_drift_found() -> Bench {
     let mut bench = Bench::new(Configuration::default());
     bench.leaves_found = true;
     bench.code = 4_096 + 61; // 1 A at rest
     bench.run_ms(1_500);
     assert_eq!(bench.order(Order::ZeroNow), Ok(()));
     bench.run_ms(3_000);
+    bench
+}
+
+/// A run that began before the result of the one before is in force would take it off once more, or undo it.
+#[test]
+fn a_zero_calibration_waits_until_the_result_before_is_in_force() {
+    let mut bench = with_zero_drift_found();
     assert_eq!(bench.order(Order::ZeroNow), Err(Refusal::Busy));
     bench.leaves_found = false;
     bench.run_ms(500);
@@ -702,12 +708,7 @@ fn a_zero_calibration_waits_until_the_result_before_is_in_force() {
 /// "Done" was said of the zero drift: a key cycle that ends before it is taken must not take its place, nor lose its own result.
 #[test]
 fn a_zero_drift_and_key_factors_found_together_are_both_stored() {
-    let mut bench = Bench::new(Configuration::default());
-    bench.leaves_found = true;
-    bench.code = 4_096 + 61; // 1 A at rest
-    bench.run_ms(1_500);
-    assert_eq!(bench.order(Order::ZeroNow), Ok(()));
-    bench.run_ms(3_000);
+    let mut bench = with_zero_drift_found();
     // Not in force yet.
     assert_eq!(bench.readings().command_state, CommandState::Running);
     bench.vehicle.acc_line = true;

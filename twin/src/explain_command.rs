@@ -422,7 +422,7 @@ fn contradictions(report: &Report) -> impl Iterator<Item = String> {
         let first = report.effects[..at]
             .iter()
             .find(|first| first.id == other.id && of_battery(&first.signal) == Some(side))?;
-        let apart = first
+        let (one, two) = first
             .parameters
             .iter()
             .zip(&other.parameters)
@@ -434,9 +434,9 @@ fn contradictions(report: &Report) -> impl Iterator<Item = String> {
         Some(format!(
             "{}: {} is {} and {}; model.toml has the values of {} for both: simulate the other with a model file of its own",
             other.id,
-            apart.0.name,
-            shown(first, apart.0),
-            shown(other, apart.1),
+            one.name,
+            shown(first, one),
+            shown(other, two),
             first.signal
         ))
     })

@@ -187,9 +187,14 @@ fn counter(model: &Model, prepared: &Prepared, readings: Readings) -> Option<Vec
         return None;
     }
     if let Some(board) = Board::new(sensor.front_end, sensor.average.unwrap_or(1)) {
-        let held = matches!(&problem.base, Base::Sensor(base) if base.held_reference);
         let mut charge_c = board
-            .run(&problem.drive, held, &problem.observed, item.pace, true)
+            .run(
+                &problem.drive,
+                is_held(problem),
+                &problem.observed,
+                item.pace,
+                true,
+            )
             .charge_c;
         if !problem.modelled.is_empty() {
             // What the effects add to the current, the meter counts too.
@@ -211,10 +216,15 @@ fn counter(model: &Model, prepared: &Prepared, readings: Readings) -> Option<Vec
     Some(counted)
 }
 
+/// Whether the reference stays at its value until its next row.
+fn is_held(problem: &Problem) -> bool {
+    matches!(&problem.base, Base::Sensor(base) if base.held_reference)
+}
+
 /// Charge of a current, in A, at the observed rows: straight lines between them, or held where the reference is; nothing over gaps.
 fn integral_c(problem: &Problem, current_a: &[f64]) -> Vec<f64> {
     let observed = &problem.observed;
-    let held = matches!(&problem.base, Base::Sensor(base) if base.held_reference);
+    let held = is_held(problem);
     let mut sum = 0.0;
     (0..current_a.len())
         .map(|row| {
