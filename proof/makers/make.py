@@ -85,13 +85,13 @@ def pairs(arguments: argparse.Namespace) -> list[tuple[pathlib.Path, pathlib.Pat
     return [(pathlib.Path(case), pathlib.Path(out)) for case, out in listed]
 
 
-def main() -> int:
+def main(arguments: list[str] | None = None) -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description="Make cases of the proof campaign.")
     parser.add_argument("pairs", nargs="*", metavar="CASE.json OUTDIR")
     parser.add_argument("--list", type=pathlib.Path, metavar="LIST.json")
     try:
-        wanted = pairs(parser.parse_args())
+        wanted = pairs(parser.parse_args(arguments))
     except ValueError as error:
         print(f"make.py: {error}", file=sys.stderr)
         return 2

@@ -93,18 +93,18 @@ def write(path: pathlib.Path, result: dict) -> None:
     part.replace(path)
 
 
-def main() -> int:
+def main(arguments: list[str] | None = None) -> int:
     """Exit code 2: an input is not what it should be."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("method", choices=sorted(METHODS))
     parser.add_argument("paths", nargs="*", metavar="FOLDER OUT.json")
     parser.add_argument("--list", metavar="LIST.json")
-    arguments = parser.parse_args()
+    wanted = parser.parse_args(arguments)
     warnings.filterwarnings("ignore")
     try:
-        for folder, out in pairs(arguments):
+        for folder, out in pairs(wanted):
             recording, holdout = load(pathlib.Path(folder))
-            write(pathlib.Path(out), score(arguments.method, recording, holdout))
+            write(pathlib.Path(out), score(wanted.method, recording, holdout))
     except (OSError, KeyError, ValueError) as why:
         print(f"error: {why!r}" if isinstance(why, KeyError) else f"error: {why}", file=sys.stderr)
         return 2

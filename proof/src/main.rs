@@ -189,20 +189,20 @@ fn run(arguments: &Run) -> Result<bool> {
             program: absolute(&arguments.twin)?,
             threads: 1,
         },
-        makers: Makers {
-            python: python.clone(),
-            folder: match &arguments.makers {
+        makers: Makers::new(
+            &python,
+            match &arguments.makers {
                 Some(folder) => absolute(folder)?,
                 None => root.join("proof/makers"),
             },
-        },
-        methods: Methods {
-            python,
-            folder: match &arguments.methods {
+        ),
+        methods: Methods::new(
+            &python,
+            match &arguments.methods {
                 Some(folder) => absolute(folder)?,
                 None => root.join("proof/methods"),
             },
-        },
+        ),
         board,
         real,
         workers,
@@ -235,7 +235,7 @@ fn run(arguments: &Run) -> Result<bool> {
     let results = pages.join("results.json");
     fs::write(&results, results::text(&summary)?)
         .with_context(|| format!("writing {}", results.display()))?;
-    let mut pictures = process::Command::new(&campaign.makers.python);
+    let mut pictures = process::Command::new(&python);
     pictures
         .arg("-B")
         .arg(campaign.root.join("proof/pictures.py"))

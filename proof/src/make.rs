@@ -3,7 +3,6 @@
 use std::{
     fs,
     path::{Path, PathBuf},
-    process::Command,
     time::Duration,
 };
 
@@ -12,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     case::{Case, Planned},
-    program,
+    program::Served,
     seal::{Safe, hash, hash_file},
 };
 
@@ -99,15 +98,22 @@ fn files(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// Python and its programs.
+/// The makers' program.
 pub struct Makers {
-    /// The interpreter.
-    pub python: PathBuf,
     /// `proof/makers`.
-    pub folder: PathBuf,
+    folder: PathBuf,
+    served: Served,
 }
 
 impl Makers {
+    /// With the interpreter, of `proof/makers`.
+    pub fn new(python: &Path, folder: PathBuf) -> Self {
+        Self {
+            served: Served::new(python.to_path_buf(), folder.join("make.py")),
+            folder,
+        }
+    }
+
     /// Over everything that decides what a maker makes: its source, and those that it imports.
     pub fn hash(&self, maker: &str) -> Result<String> {
         let mut all = String::new();
@@ -204,16 +210,11 @@ impl Makers {
     fn run(&self, list: &[[PathBuf; 2]], out: &Path, first: &Case) -> Result<()> {
         let file = out.join(format!("list-{}.json", first.id));
         fs::write(&file, serde_json::to_string(list)?)?;
-        let mut command = Command::new(&self.python);
-        command
-            .arg("-B")
-            .arg(self.folder.join("make.py"))
-            .arg("--list")
-            .arg(&file);
-        one_thread(&mut command);
-        let ran = program::run(&mut command, LIMIT * u32::try_from(list.len().max(1))?);
+        let arguments = ["--list".to_owned(), file.display().to_string()];
+        let limit = LIMIT * u32::try_from(list.len().max(1))?;
+        let ran = self.served.run(&arguments, limit);
         fs::remove_file(&file)?;
-        ran.map(|_| ())
+        ran
     }
 }
 
@@ -278,14 +279,6 @@ fn take(planned: &Planned, pair: &[PathBuf; 2], out: &Path, safe: &Safe) -> Resu
         }
     }
     Ok(())
-}
-
-/// Libraries that would use every processor for one process.
-pub fn one_thread(command: &mut Command) {
-    for variable in ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"] {
-        command.env(variable, "1");
-    }
-    command.env("PYBAMM_DISABLE_TELEMETRY", "true");
 }
 
 /// Over the Python files of a folder, by name.

@@ -1,19 +1,15 @@
-//! What people use today, as processes of their own on the same files.
+//! What people use today, in processes of their own on the same files.
 
 use std::{
     fs,
     path::{Path, PathBuf},
-    process::Command,
     time::Duration,
 };
 
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
 
-use crate::{
-    make::{Folders, one_thread},
-    program,
-};
+use crate::{make::Folders, program::Served};
 
 /// Processor time for one recording: many times what the slowest explanation takes.
 const LIMIT: Duration = Duration::from_secs(120);
@@ -44,15 +40,22 @@ pub struct Found {
     pub error: Option<String>,
 }
 
-/// Python and its programs.
+/// The methods' program.
 pub struct Methods {
-    /// The interpreter.
-    pub python: PathBuf,
     /// `proof/methods`.
     pub folder: PathBuf,
+    served: Served,
 }
 
 impl Methods {
+    /// With the interpreter, of `proof/methods`.
+    pub fn new(python: &Path, folder: PathBuf) -> Self {
+        Self {
+            served: Served::new(python.to_path_buf(), folder.join("run.py")),
+            folder,
+        }
+    }
+
     /// One method on one case.
     pub fn run(&self, method: &str, folders: &Folders) -> Found {
         match self.ran(method, folders) {
@@ -83,26 +86,19 @@ impl Methods {
             }
         }
         let out = folder.join(format!("{method}.json"));
-        let mut command = Command::new(&self.python);
-        command
-            .arg("-B")
-            .arg(self.program())
-            .arg(method)
-            .arg(&folder)
-            .arg(&out);
-        one_thread(&mut command);
-        program::run(&mut command, LIMIT)?;
+        let arguments = [
+            method.to_owned(),
+            folder.display().to_string(),
+            out.display().to_string(),
+        ];
+        self.served.run(&arguments, LIMIT)?;
         let text =
             fs::read_to_string(&out).with_context(|| format!("reading {}", out.display()))?;
         serde_json::from_str(&text).with_context(|| format!("reading {}", out.display()))
     }
 
-    fn program(&self) -> PathBuf {
-        self.folder.join("run.py")
-    }
-
     /// Whether they are there at all.
     pub fn there(&self) -> bool {
-        Path::new(&self.program()).exists()
+        self.served.program().exists()
     }
 }

@@ -22,6 +22,7 @@ use crate::{
     case::{Group, Planned, Truth},
     make::{Folders, Makers, hash_of_sources},
     methods::{Found, Methods},
+    program::locked,
     real::Expected,
     score::{self, Judgement},
     seal::{Safe, hash, hash_file},
@@ -33,7 +34,7 @@ use crate::{
 const LIMIT: Duration = Duration::from_secs(60);
 /// Of a real recording, which may have 48,000 rows.
 const LIMIT_REAL: Duration = Duration::from_secs(200);
-/// Cases that one process of the makers makes: starting Python and its libraries takes seconds.
+/// Cases that are made at one go: they share what is the same in all of them.
 const BATCH: usize = 10;
 
 /// Everything about one case; one file of `results/`.
@@ -155,11 +156,12 @@ struct Sources {
 }
 
 /// What is worked out while a case runs, and kept; how an answer is judged is worked out anew each time.
-const OWN: [&str; 9] = [
+const OWN: [&str; 10] = [
     include_str!("run.rs"),
     include_str!("tool.rs"),
     include_str!("make.rs"),
     include_str!("program.rs"),
+    include_str!("serve.py"),
     include_str!("real.rs"),
     include_str!("board.rs"),
     include_str!("table.rs"),
@@ -619,13 +621,6 @@ fn mixed(batches: VecDeque<Vec<(Planned, String)>>) -> VecDeque<Vec<(Planned, St
     batches.into()
 }
 
-fn locked<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
-    match mutex.lock() {
-        Ok(guard) => guard,
-        Err(poisoned) => poisoned.into_inner(),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
@@ -638,23 +633,25 @@ mod tests {
     /// A maker that knows one clean recording.
     const MAKER: &str = r#"
 import json, pathlib, sys
-with open(pathlib.Path(__file__).parent / "runs", "a") as runs:
-    print("run", file=runs)
-for case, out in json.loads(pathlib.Path(sys.argv[2]).read_text()):
-    out = pathlib.Path(out)
-    out.mkdir()
-    for name in ("recording.csv", "holdout.csv"):
-        (out / name).write_text("t_s,i_ref_a,i_meas_a\n0,1,1\n1,2,2\n")
-    (out / "model.toml").write_text("schema = 1\n")
-    (out / "truth.json").write_text('{"kind": "d", "maker": "test"}')
+def main(arguments):
+    with open(pathlib.Path(__file__).parent / "runs", "a") as runs:
+        print("run", file=runs)
+    for case, out in json.loads(pathlib.Path(arguments[1]).read_text()):
+        out = pathlib.Path(out)
+        out.mkdir()
+        for name in ("recording.csv", "holdout.csv"):
+            (out / name).write_text("t_s,i_ref_a,i_meas_a\n0,1,1\n1,2,2\n")
+        (out / "model.toml").write_text("schema = 1\n")
+        (out / "truth.json").write_text('{"kind": "d", "maker": "test"}')
 "#;
 
     /// A method that always names the same.
     const METHOD: &str = r#"
 import json, pathlib, sys
-with open(pathlib.Path(__file__).parent / "runs", "a") as runs:
-    print("run", file=runs)
-pathlib.Path(sys.argv[3]).write_text(json.dumps({"named": ["offset"]}))
+def main(arguments):
+    with open(pathlib.Path(__file__).parent / "runs", "a") as runs:
+        print("run", file=runs)
+    pathlib.Path(arguments[2]).write_text(json.dumps({"named": ["offset"]}))
 "#;
 
     /// A tool that says "no mismatch", but fails if the seal is not on the disk or the truth is in reach.
@@ -690,14 +687,8 @@ fi
                 program,
                 threads: 1,
             },
-            makers: Makers {
-                python: PathBuf::from("python3"),
-                folder: maker.parent().unwrap().to_path_buf(),
-            },
-            methods: Methods {
-                python: PathBuf::from("python3"),
-                folder: folder.join("methods"),
-            },
+            makers: Makers::new(Path::new("python3"), maker.parent().unwrap().to_path_buf()),
+            methods: Methods::new(Path::new("python3"), folder.join("methods")),
             board: None,
             limit: None,
             real: Vec::new(),
@@ -807,7 +798,11 @@ fi
         let folder = tempfile::tempdir().unwrap();
         let campaign = campaign(folder.path(), TOOL);
         let maker = folder.path().join("makers/make.py");
-        fs::write(maker, "import sys\nsys.exit('no such strength')\n").unwrap();
+        fs::write(
+            maker,
+            "def main(_):\n    raise SystemExit('no such strength')\n",
+        )
+        .unwrap();
         let records = campaign.run(&plan()).unwrap();
         let why = records[0].not_made.as_ref().unwrap();
         assert!(why.contains("no such strength"), "{why}");
