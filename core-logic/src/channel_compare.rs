@@ -208,9 +208,9 @@ struct SupplyDoubt {
     readings: u8,
 }
 
-/// The longest conversion, at 8 samples a second, may have begun before the supply moved, and the meter follows in 50 ms:
-/// (125 + 50) ms / 10 ms between two readings, rounded up.
-const SUPPLY_DOUBT_READINGS: u8 = 18;
+/// A conversion may have begun before the supply moved; one at 8 samples a second is waited for half as long again as the nominal
+/// 125 ms (`PollPace`), and the meter follows in 50 ms: (187.5 + 50) ms / 10 ms between two readings, rounded up.
+const SUPPLY_DOUBT_READINGS: u8 = 24;
 
 /// A meter that stands still, from the report that showed its last count on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

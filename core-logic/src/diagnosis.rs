@@ -131,8 +131,8 @@ diagnoses! {
         "third byte of any read (`ConverterConfig`)";
         0 ms, 100 ms, Warning, WhileActive, [CHIP_FAULT] [] []
     5 ConverterStale: "No new conversion in time.",
-        "three conversion periods (`ConverterConfig`)";
-        0 ms, 0 ms, Error, WhileActive, [STALE] [] []
+        "three conversion periods (`ConverterConfig`); the readings say *stale* themselves, just as long as they are";
+        0 ms, 500 ms, Error, WhileActive, [] [] []
     6 ConverterStuck: "The conversion result does not move although the current does.",
         "repeats beyond `ConverterConfig` while the meter's mean current moves";
         0 ms, 1000 ms, Error, WhileActive, [IMPLAUSIBLE] [] []
@@ -722,22 +722,28 @@ mod tests {
         let mut diagnosis = Diagnosis::default();
         for n in 0..70_000 {
             let on = if n % 2 == 0 {
-                only(Code::ConverterStale)
+                only(Code::SupplyCalibrationInvalid)
             } else {
                 CodeSet::EMPTY
             };
             diagnosis.step(at(n), on);
         }
-        assert_eq!(diagnosis.detail(Code::ConverterStale).occurrences, 35_000);
+        assert_eq!(
+            diagnosis.detail(Code::SupplyCalibrationInvalid).occurrences,
+            35_000
+        );
         for n in 70_000..140_000 {
             let on = if n % 2 == 0 {
-                only(Code::ConverterStale)
+                only(Code::SupplyCalibrationInvalid)
             } else {
                 CodeSet::EMPTY
             };
             diagnosis.step(at(n), on);
         }
-        assert_eq!(diagnosis.detail(Code::ConverterStale).occurrences, u16::MAX);
+        assert_eq!(
+            diagnosis.detail(Code::SupplyCalibrationInvalid).occurrences,
+            u16::MAX
+        );
     }
 
     #[test]

@@ -1392,8 +1392,11 @@ impl Measurement {
         match self.average.average(&configuration.average, self.now) {
             Some(average) => (
                 average.current,
-                // A single bad conversion does not enter the average and so does not spoil it.
-                self.current_validity(Validity::VALID),
+                // A single bad conversion does not enter the average and so does not spoil it; one that is missing does.
+                self.current_validity(Validity::VALID.and_if(
+                    self.reading.validity.contains(Validity::STALE),
+                    Validity::STALE,
+                )),
                 Some(average),
             ),
             None => (

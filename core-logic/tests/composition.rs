@@ -999,6 +999,34 @@ fn another_data_rate_raises_no_diagnosis() {
     }
 }
 
+/// A bad joint: the converter is silent for 200 ms, again and again. The readings say so each time, and are valid in between at
+/// once; what is logged is one diagnosis, not one for each silence.
+#[test]
+fn a_converter_that_is_silent_again_and_again_is_one_diagnosis() {
+    const SILENCES: u16 = 20;
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(2_000);
+    for _ in 0..SILENCES {
+        bench.next_conversion = u64::MAX;
+        bench.run_ms(200);
+        let average = bench.measurement.current_average(&bench.configuration);
+        for validity in [bench.measurement.current().validity, average.validity] {
+            assert!(validity.contains(Validity::STALE), "{validity:?}");
+        }
+        assert!(bench.has(Code::ConverterStale));
+        bench.next_conversion = bench.now;
+        bench.run_ms(40);
+        let average = bench.measurement.current_average(&bench.configuration);
+        for validity in [bench.measurement.current().validity, average.validity] {
+            assert!(validity.is_valid(), "{validity:?}");
+        }
+    }
+    let detail = bench.measurement.diagnosis().detail(Code::ConverterStale);
+    assert_eq!(detail.occurrences, 1);
+    bench.run_ms(1_000);
+    assert!(!bench.has(Code::ConverterStale));
+}
+
 #[test]
 fn the_meters_state_is_the_charges_validity() {
     let mut bench = Bench::new(Configuration::default());

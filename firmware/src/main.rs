@@ -130,7 +130,7 @@ mod app {
     /// Ten seconds: a conversion adds a little noise to the energy.
     const TEMPERATURE_EVERY_POLLS: u32 = 500;
     /// The result is fetched this long before the next conversion, when even a slow one has ended.
-    const TEMPERATURE_AFTER_POLLS: u32 = 400;
+    const TEMPERATURE_FETCH_POLLS_BEFORE: u32 = 400;
     const TICK_MS: u32 = 10;
     /// Idle looks for late tasks at most this often.
     const IDLE_LOOK_US: u32 = 10_000;
@@ -426,7 +426,7 @@ mod app {
             } else if poll {
                 poll = false;
                 polls_to_temperature = polls_to_temperature.saturating_sub(1);
-                fetch = polls_to_temperature == TEMPERATURE_AFTER_POLLS;
+                fetch = polls_to_temperature == TEMPERATURE_FETCH_POLLS_BEFORE;
                 if meter.is_counting() {
                     waits = meter.snapshot(
                         |at| cx.shared.edges.lock(|edges| edges.history(at)),
