@@ -293,6 +293,9 @@ impl<'s> Course<'s> {
             let at = |cursor: &Cursor<'_>, t| low_pass.beyond(cursor, t, self.held);
             mean -= low_pass.tau_s * (at(to, to_s) - at(from, from_s)) / length_s;
         }
+        if self.between.decays.is_empty() {
+            return mean;
+        }
         let [from, to] = &mut self.decays;
         let ends = from.iter_mut().zip(to);
         let decayed = ends.map(|(from, to)| to.until(to_s) - from.until(from_s));

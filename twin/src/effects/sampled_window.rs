@@ -1,7 +1,7 @@
 //! Only a part of each period is measured.
 
 use super::between::Converter;
-use super::scene::{Scale, Scene, floored};
+use super::scene::{Scale, Scene};
 use crate::spectrum;
 
 use super::{Card, Clues, Effect, Parameter, Search, Stage};
@@ -14,6 +14,8 @@ const LINES: usize = 16;
 const UPDATES: usize = 6;
 /// The best of the lines.
 const BEST: usize = 6;
+/// Added and taken away again, it leaves a number rounded: in lanes, as no conversion to an integer is.
+const WHOLE: f64 = 1.5 * (1u64 << 52) as f64;
 /// Cycles that the age of a reading goes through in a recording at least: with fewer it is a delay.
 const CYCLES: f64 = 6.0;
 
@@ -201,6 +203,27 @@ fn seen(period: f64, late_s: f64, age: f64) -> Vec<f64> {
     vec![period, duty, -(duty + age) * period]
 }
 
+/// Courses of the age that are summed side by side.
+const WAYS: usize = 6;
+
+/// Of courses of the age, each by its beat in Hz and its phase in turns: Σ rate·(rate·age), Σ (rate·age)² and Σ off·(rate·age) over rows
+/// of time in s, rate and what they are off.
+fn of_ages(ages: [[f64; 2]; WAYS], rows: impl Iterator<Item = [f64; 3]>) -> [[f64; 3]; WAYS] {
+    let (mut ra, mut aa, mut oa) = ([0.0; WAYS], [0.0; WAYS], [0.0; WAYS]);
+    for [t_s, rate, off] in rows {
+        for (k, [beat_hz, phase]) in ages.iter().enumerate() {
+            let turns = beat_hz * t_s + phase;
+            let nearest = (turns + WHOLE) - WHOLE;
+            let below = if nearest > turns { 1.0 } else { 0.0 };
+            let age = rate * (turns - (nearest - below));
+            ra[k] += rate * age;
+            aa[k] += age * age;
+            oa[k] += off * age;
+        }
+    }
+    std::array::from_fn(|k| [ra[k], aa[k], oa[k]])
+}
+
 /// Starts from how late readings are: by half a window, and by their age, which rises from nothing to a period and falls back. At
 /// the rows it does so at a beat of the period with them, also where the period is much shorter than a row.
 fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
@@ -239,6 +262,7 @@ fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
     let (rr, or) = rows().fold((0.0, 0.0), |(rr, or), row| {
         (rr + rate[row] * rate[row], or + off[row] * rate[row])
     });
+    let row = |row: usize| [t_s[row], rate[row], off[row]];
     let mut found: Vec<(f64, [f64; 4])> = Vec::new();
     for line in spectrum::strongest(&t_s, &course, step, LINES) {
         if line * span < CYCLES {
@@ -248,26 +272,31 @@ fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
         for beat in [-0.5, -0.25, 0.0, 0.25, 0.5].map(|by| line + by / span) {
             let turns = -turns(beat, rows().map(|row| (t_s[row], course[row])));
             // Ages rise at the beat, or fall: where the period is a little shorter, or longer, than what fits into a row.
-            for (way, phase) in [(1.0, turns - 0.25), (-1.0, -turns - 0.25)] {
-                for phase in [phase - 0.04, phase, phase + 0.04] {
-                    let (mut ra, mut aa, mut oa) = (0.0, 0.0, 0.0);
-                    for row in rows() {
-                        let turns = way * beat * t_s[row] + phase;
-                        let age = rate[row] * (turns - floored(turns));
-                        ra += rate[row] * age;
-                        aa += age * age;
-                        oa += off[row] * age;
-                    }
-                    let whole = rr * aa - ra * ra;
-                    if whole <= 0.0 {
-                        continue;
-                    }
-                    let period = (oa * rr - or * ra) / whole;
-                    let least = (or * aa - oa * ra) / whole;
-                    let gain = period * oa + least * or;
-                    if period > 0.0 && best.is_none_or(|(most, _)| gain > most) {
-                        best = Some((gain, [way * beat, phase, period, least]));
-                    }
+            let ages: [(f64, f64); WAYS] = {
+                let [rises, falls] = [turns - 0.25, -turns - 0.25];
+                [
+                    (1.0, rises - 0.04),
+                    (1.0, rises),
+                    (1.0, rises + 0.04),
+                    (-1.0, falls - 0.04),
+                    (-1.0, falls),
+                    (-1.0, falls + 0.04),
+                ]
+            };
+            let sums = of_ages(
+                ages.map(|(way, phase)| [way * beat, phase]),
+                rows().map(row),
+            );
+            for ((way, phase), [ra, aa, oa]) in ages.into_iter().zip(sums) {
+                let whole = rr * aa - ra * ra;
+                if whole <= 0.0 {
+                    continue;
+                }
+                let period = (oa * rr - or * ra) / whole;
+                let least = (or * aa - oa * ra) / whole;
+                let gain = period * oa + least * or;
+                if period > 0.0 && best.is_none_or(|(most, _)| gain > most) {
+                    best = Some((gain, [way * beat, phase, period, least]));
                 }
             }
         }

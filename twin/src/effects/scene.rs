@@ -708,8 +708,12 @@ impl<'a> Scene<'a> {
             // a constant time lies there on a straight line between the gap's ends.
             let operation = self.operations[segment].clone();
             let start = drive.t_s[operation.start];
-            // What the sensor's clock calls t was at this time.
-            let reference_s = |t: f64| start + (t - start) / skew - delay_s;
+            // What the sensor's clock calls t was at this time. Most clocks are right, and a division by 1 takes as long as any other.
+            let reference_s = |t: f64| {
+                let since_s = t - start;
+                let since_s = if skew == 1.0 { since_s } else { since_s / skew };
+                start + since_s - delay_s
+            };
             let around = if total.is_some() {
                 rows.clone()
             } else {
@@ -730,6 +734,10 @@ impl<'a> Scene<'a> {
             let values = &mut sampled[these.clone()];
             if !straight {
                 self.at(segment, times, reference_s, values);
+                if operation == rows {
+                    // No gap to point into.
+                    continue;
+                }
                 let shifted = times.iter().map(|t| reference_s(*t));
                 for (value, t) in values.iter_mut().zip(shifted) {
                     if is_ahead(t) || is_behind(t) {
