@@ -6,6 +6,8 @@
 //! same signature against the residual moved in time (and half of them reversed): whatever it gains is chance and colour of the
 //! noise. Each draw keeps the best of all candidates, so that trying many effects is paid for.
 
+use std::sync::Arc;
+
 use nalgebra::{DMatrix, DMatrixView, DVector, Dyn};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng as _, SeedableRng as _};
@@ -89,14 +91,50 @@ fn stepped(effect: &dyn Effect) -> bool {
 #[derive(Debug)]
 pub struct Screening {
     /// Candidates, best first; several entries of one effect may follow each other.
-    pub entries: Vec<Entry>,
+    pub entries: Vec<Arc<Entry>>,
     /// 99th percentile of the placebos' best gains.
     pub placebo_p99: f64,
-    /// Squared error of the residual that they are compared with.
+    screened: Arc<Screened>,
+}
+
+/// What screening a residual gives whatever the placebos are: the same fits are screened again and again.
+pub(super) struct Screened {
+    entries: Vec<Arc<Entry>>,
+    /// Starts of every candidate.
+    starts: Vec<(&'static dyn Effect, Vec<Vec<f64>>)>,
+    /// What they are compared with, over the rows of a thinned bench, and its blocks in them.
+    residual: Vec<f64>,
+    blocks: Vec<std::ops::Range<usize>>,
+    /// Squared error of it.
     energy: f64,
 }
 
+impl std::fmt::Debug for Screened {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Screened")
+            .field("entries", &self.entries)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Screened {
+    /// Values that it takes memory for, nearly.
+    pub(super) fn size(&self) -> usize {
+        let columns = self.entries.iter().map(|entry| entry.columns.len());
+        (columns.sum::<usize>() + 1) * self.residual.len()
+    }
+}
+
 impl Screening {
+    /// Where a candidate was begun from.
+    pub fn starts(&self, effect: &dyn Effect) -> Option<&[Vec<f64>]> {
+        let same = |other: &&'static dyn Effect| std::ptr::eq(other.card(), effect.card());
+        let mut starts = self.screened.starts.iter();
+        starts
+            .find(|(other, _)| same(other))
+            .map(|(_, starts)| starts.as_slice())
+    }
+
     /// Of some entries those pairs that hide each other, at most so many, the best first: together they take at least a share of all of
     /// the error, and each alone less than half of what both do.
     pub fn hidden<'e>(
@@ -122,7 +160,7 @@ impl Screening {
                 let [(gram_a, sums_a, alone_a), (gram_b, sums_b, alone_b)] = [&own[a], &own[b]];
                 let both = taken_together(columns, [gram_a, gram_b], [sums_a, sums_b]);
                 let hides = alone_a.max(*alone_b) < HIDDEN * both;
-                (hides && both >= least * self.energy).then_some((both, [a, b]))
+                (hides && both >= least * self.screened.energy).then_some((both, [a, b]))
             })
             .collect();
         pairs.sort_by(|one, other| other.0.total_cmp(&one.0));
@@ -181,6 +219,22 @@ fn thin(bench: &Workbench<'_>) -> Thin {
 
 /// Entries of every candidate that the model does not have, and placebos.
 pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Screening {
+    let screened = bench.screened(&fit.model, || screened(bench, fit));
+    let timeless = bench.problem.quasi_static();
+    let Screened {
+        entries,
+        residual,
+        blocks,
+        ..
+    } = &*screened;
+    Screening {
+        placebo_p99: placebos(entries, residual, blocks, timeless, seed, draws),
+        entries: entries.clone(),
+        screened,
+    }
+}
+
+fn screened(bench: &Workbench<'_>, fit: &Fit) -> Screened {
     let thin = thin(bench);
     let sigma = bench.spread(&fit.residual);
     let take = |series: &[f64]| {
@@ -219,18 +273,16 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
         column
     };
     let as_read = bench.as_read(&fit.predicted);
-    let candidates: Vec<(&'static dyn Effect, Vec<f64>)> = bench
+    let starts: Vec<(&'static dyn Effect, Vec<Vec<f64>>)> = bench
         .library
         .par_iter()
         .copied()
         .filter(|effect| may_join(&fit.model, *effect))
-        .flat_map_iter(|effect| {
-            let clues = bench.clues(&as_read);
-            effect
-                .starts(&bench.scale, &clues)
-                .into_iter()
-                .map(move |values| (effect, values))
-        })
+        .map(|effect| (effect, effect.starts(&bench.scale, &bench.clues(&as_read))))
+        .collect();
+    let candidates: Vec<(&'static dyn Effect, Vec<f64>)> = starts
+        .iter()
+        .flat_map(|(effect, starts)| starts.iter().map(|values| (*effect, values.clone())))
         .collect();
     let mut signatures: Vec<Signature> = candidates
         .into_par_iter()
@@ -275,7 +327,7 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
         })
         .collect();
     fewer(&mut signatures, &residual);
-    let mut entries: Vec<Entry> = signatures
+    let mut entries: Vec<Arc<Entry>> = signatures
         .into_par_iter()
         .map(|signature| {
             let columns = signature.columns;
@@ -296,7 +348,7 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
             };
             let rights = products(&residual);
             let raw_gain = folds.taken(&products(&whole)) / dot(&whole, &whole).max(1e-300);
-            Entry {
+            Arc::new(Entry {
                 member: Member {
                     effect: signature.effect,
                     values: signature.values,
@@ -307,15 +359,15 @@ pub fn screen(bench: &Workbench<'_>, fit: &Fit, seed: u64, draws: usize) -> Scre
                 columns,
                 folds,
                 rights,
-            }
+            })
         })
         .collect();
     entries.sort_by(|a, b| b.gain.total_cmp(&a.gain));
-    let timeless = bench.problem.quasi_static();
-    let placebo_p99 = placebos(&entries, &residual, &thin.blocks, timeless, seed, draws);
-    Screening {
+    Screened {
         entries,
-        placebo_p99,
+        starts,
+        residual,
+        blocks: thin.blocks,
         energy: all,
     }
 }
@@ -614,7 +666,7 @@ impl Likeness {
 }
 
 fn placebos(
-    entries: &[Entry],
+    entries: &[Arc<Entry>],
     residual: &[f64],
     blocks: &[std::ops::Range<usize>],
     timeless: bool,
@@ -736,7 +788,7 @@ mod tests {
             problem.drive.sensor_temperature_c = Some(temperature_c.collect());
             let bench = Workbench::new(&problem, &[]);
             let screening = screen(&bench, &fit(&bench, &Model::default(), None), 0, 0);
-            let entries: Vec<&Entry> = screening.entries.iter().collect();
+            let entries: Vec<&Entry> = screening.entries.iter().map(Arc::as_ref).collect();
             let pairs = screening.hidden(&entries, 0.5, 4);
             let mut ids = pairs.iter().map(|pair| pair.map(|entry| entry.member.id()));
             ids.any(|pair| {

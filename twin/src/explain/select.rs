@@ -8,6 +8,8 @@ mod marks;
 mod obstacle;
 mod rivals;
 
+use std::sync::Arc;
+
 use rayon::prelude::*;
 
 pub use grow::added;
@@ -200,7 +202,7 @@ impl Search<'_, '_> {
             );
             let seed = self.seed.wrapping_add(done as u64);
             let mut screening = screen(self.bench, &now, seed, DRAWS);
-            let tried = |entry: &Entry| !self.barred.contains(&entry.member.form());
+            let tried = |entry: &Arc<Entry>| !self.barred.contains(&entry.member.form());
             screening.entries.retain(tried);
             let (decisions, refused) = (&mut self.decisions, &mut self.refused);
             let Some((better, p99)) = addition(self.bench, &now, &screening, decisions, refused)

@@ -1,9 +1,9 @@
 //! One problem, ready to be fitted: the rows that count, blocks of them, and what sizes are natural.
 
 use std::borrow::Cow;
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::ops::Range;
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex};
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng as _;
@@ -12,6 +12,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 use super::apart::reads_apart;
 use super::censored::{Censored, Contradiction};
 use super::robust::spread;
+use super::screen::Screened;
 use super::slope::change;
 use super::starts::Start;
 use super::steady::Steady;
@@ -27,6 +28,8 @@ use crate::problem::{
 /// Rows that fits look at; of longer recordings one is drawn from each of as many stretches (the simulation still runs over every row). [`Problem::thinned`]
 /// does so ahead, for less memory; here it is done for what it leaves as it is.
 pub const MOST_ROWS: usize = 250_000;
+/// Values in the columns of the screenings that are remembered: 64 MB.
+const MOST_SCREENED: usize = 8_000_000;
 /// Blocks that are held out in turn.
 const BLOCKS: usize = 24;
 /// Rows that a block has at least: with fewer than eight blocks, random signs would be all the same too often to be placebos.
@@ -157,6 +160,8 @@ pub struct Workbench<'a> {
     pub modelled: f64,
     /// Fits that were made: from which model to which, with spread and loss.
     known: Mutex<HashMap<Key, (Model, f64, f64)>>,
+    /// The last screenings, by the model whose residual was screened, the newest first.
+    screened: Mutex<VecDeque<(ScreenedKey, Arc<Screened>)>>,
     /// What the readings show by themselves or beside the simulation as designed, by effect: found once.
     marks: Vec<(&'static str, Mark)>,
     /// Readings that tell no more than within what the signal was: simulations stop short of what makes them so.
@@ -198,6 +203,9 @@ type Key = (
     bool,
     Option<(usize, usize)>,
 );
+
+/// The same with [`Nuisance::resistances_at_c`], which no fit begins from.
+type ScreenedKey = (Key, Option<[f64; 2]>);
 
 fn key(model: &Model) -> Key {
     let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect();
@@ -350,6 +358,7 @@ impl<'a> Workbench<'a> {
             blocks,
             library,
             known: Mutex::default(),
+            screened: Mutex::default(),
             censored,
             contradiction,
             white: None,
@@ -383,6 +392,7 @@ impl<'a> Workbench<'a> {
             modelled: self.modelled,
             marks: self.marks.clone(),
             known: Mutex::default(),
+            screened: Mutex::default(),
             censored: self.censored.clone(),
             contradiction: self.contradiction.clone(),
             white: Some((whitening, y)),
@@ -446,6 +456,27 @@ impl<'a> Workbench<'a> {
         if let Ok(mut known) = self.known.lock() {
             known.insert(key(from), (to.clone(), sigma, cost));
         }
+    }
+
+    /// The screening of a model's residual, if it is one of the last, or a new one.
+    pub(super) fn screened(&self, model: &Model, new: impl FnOnce() -> Screened) -> Arc<Screened> {
+        let key = (key(model), model.nuisance.resistances_at_c);
+        let is_same = |(known, _): &&(ScreenedKey, Arc<Screened>)| *known == key;
+        if let Ok(known) = self.screened.lock()
+            && let Some((_, screened)) = known.iter().find(is_same)
+        {
+            return Arc::clone(screened);
+        }
+        let screened = Arc::new(new());
+        if let Ok(mut known) = self.screened.lock() {
+            known.push_front((key, Arc::clone(&screened)));
+            let mut size = 0;
+            known.retain(|(_, screened)| {
+                size += screened.size();
+                size <= MOST_SCREENED
+            });
+        }
+        screened
     }
 
     /// Rows that count.

@@ -1,5 +1,7 @@
 //! The effect, or the two that hide each other, with which a model grows.
 
+use std::sync::Arc;
+
 use rayon::prelude::*;
 
 use super::losses::{losses, share};
@@ -45,8 +47,9 @@ pub(super) fn addition(
     let (free, plain): (Vec<&Entry>, Vec<&Entry>) = screening
         .entries
         .iter()
+        .map(Arc::as_ref)
         .partition(|entry| entry.member.effect.remembers());
-    let all: Vec<&Entry> = screening.entries.iter().collect();
+    let all: Vec<&Entry> = screening.entries.iter().map(Arc::as_ref).collect();
     let mut grown =
         |entries: &[&Entry]| added_of(bench, now, (entries, screening), decisions, refused);
     grown(&plain).or_else(|| (!free.is_empty()).then(|| grown(&all)).flatten())
@@ -285,7 +288,7 @@ fn pair(
             let begun = |entry: &&Entry| {
                 taken + entry.gain * (1.0 - taken) > STARTED * least && may_follow(entry)
             };
-            let seconds: Vec<&Entry> = seconds.iter().filter(begun).collect();
+            let seconds: Vec<&Entry> = seconds.iter().map(Arc::as_ref).filter(begun).collect();
             promising(bench, first, &seconds, FIRSTS, 1)
         })
         // One more branch of the first is no second effect.

@@ -69,7 +69,7 @@ fn rivals(
             continue;
         }
         members.extend(
-            nearest(bench, without, effect)
+            nearest(bench, without, effect, screening.starts(effect))
                 .into_iter()
                 .filter(|member| {
                     members.iter().all(|known| {
@@ -83,11 +83,21 @@ fn rivals(
     members
 }
 
-/// The starts of an effect that come nearest to the readings, beside the effects of a fit.
-fn nearest(bench: &Workbench<'_>, beside: &Fit, effect: &'static dyn Effect) -> Vec<Member> {
-    let as_read = bench.as_read(&beside.predicted);
-    let mut starts: Vec<(f64, Member)> = effect
-        .starts(&bench.scale, &bench.clues(&as_read))
+/// The starts of an effect that come nearest to the readings, beside the effects of a fit; its starts may be known.
+fn nearest(
+    bench: &Workbench<'_>,
+    beside: &Fit,
+    effect: &'static dyn Effect,
+    known: Option<&[Vec<f64>]>,
+) -> Vec<Member> {
+    let starts = known.map_or_else(
+        || {
+            let as_read = bench.as_read(&beside.predicted);
+            effect.starts(&bench.scale, &bench.clues(&as_read))
+        },
+        <[_]>::to_vec,
+    );
+    let mut starts: Vec<(f64, Member)> = starts
         .into_par_iter()
         .map(|values| {
             let member = Member { effect, values };
@@ -108,7 +118,7 @@ fn of_two(bench: &Workbench<'_>, without: &Fit, one: &'static dyn Effect) -> Vec
     let begun = |beside: &Fit, id: &str| -> Option<Model> {
         let mut library = bench.library.iter().copied();
         let effect = library.find(|effect| effect.card().id == id && !beside.model.has(id))?;
-        let start = nearest(bench, beside, effect).into_iter().next()?;
+        let start = nearest(bench, beside, effect, None).into_iter().next()?;
         Some(beside.model.with(start))
     };
     let pairs = one.stands_for().iter();
