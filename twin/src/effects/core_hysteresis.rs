@@ -272,6 +272,8 @@ impl Effect for CoreHysteresis {
 
 /// Relays of a closed core.
 const RELAYS: usize = 5;
+/// Relays that are worked out side by side.
+const LANES: usize = RELAYS.next_multiple_of(2);
 /// Their thresholds in units of the coercive current: those of the stops of a core with a gap, so that the name means the same.
 const THRESHOLDS: [f64; RELAYS] = [0.5, 0.75, 1.0, 1.25, 1.5];
 
@@ -291,7 +293,8 @@ struct Relays {
 
 /// From −1 to 1, over a width of one to each side.
 fn ramp(x: f64) -> f64 {
-    x.clamp(-1.0, 1.0)
+    let x = if x > 1.0 { 1.0 } else { x };
+    if x < -1.0 { -1.0 } else { x }
 }
 
 impl Relays {
@@ -306,23 +309,28 @@ impl Relays {
 
     /// Adds what the core keeps, from a demagnetised one on: half of its parts each way.
     fn add(&self, signal: &mut [f64]) {
-        let mut turned = [0.0f64; RELAYS];
+        // Side by side and in pairs, beside an idle one, without a branch: short of the last part of its ramp a relay would be turned to
+        // less than one end.
+        let lanes = |of: &[f64; RELAYS]| -> [f64; LANES] {
+            std::array::from_fn(|k| of.get(k).copied().unwrap_or(1.0))
+        };
+        let (thresholds_a, per_ramp) = (lanes(&self.thresholds_a), lanes(&self.per_ramp));
+        let mut turned = [0.0; LANES];
         for value in signal {
-            let mut sum = 0.0;
-            let relays = self.thresholds_a.iter().zip(&self.per_ramp);
-            for (turned, (c, per)) in turned.iter_mut().zip(relays) {
-                let rising = ramp((*value - c) * per);
-                let falling = ramp((*value + c) * per);
+            let here = *value;
+            let mut kept = [0.0; LANES];
+            for k in 0..LANES {
+                let rising = ramp((here - thresholds_a[k]) * per_ramp[k]);
+                let falling = ramp((here + thresholds_a[k]) * per_ramp[k]);
                 let stays = |reached: f64| 2.0 * ramp((reached - STAYS) / (1.0 - STAYS)) - 1.0;
-                if rising > STAYS {
-                    *turned = turned.max(stays(rising));
-                }
-                if falling < -STAYS {
-                    *turned = turned.min(-stays(-falling));
-                }
-                sum +=
-                    0.5 * ((rising + falling) + *turned * (falling - rising)) - ramp(*value * per);
+                let (up, down) = (stays(rising), -stays(-falling));
+                let turn = if up > turned[k] { up } else { turned[k] };
+                turned[k] = if down < turn { down } else { turn };
+                kept[k] = 0.5 * ((rising + falling) + turned[k] * (falling - rising))
+                    - ramp(here * per_ramp[k]);
             }
+            let [a, b, c, d, e, _] = kept;
+            let sum = 0.0 + a + b + c + d + e;
             *value += self.weight * sum;
         }
     }
