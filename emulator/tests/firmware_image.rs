@@ -366,8 +366,10 @@ fn every_request_is_answered_whatever_else_the_board_does() {
     // Messages, communication errors … character overruns.
     let answer = rig.modbus(&[1, 4, 0x01, 0x30, 0, 12]).unwrap();
     let counters: Vec<u32> = answer[3..]
-        .chunks_exact(4)
-        .map(|bytes| u32::from_be_bytes(bytes.try_into().unwrap()))
+        .as_chunks()
+        .0
+        .iter()
+        .map(|bytes| u32::from_be_bytes(*bytes))
         .collect();
     assert_eq!((counters[1], counters[5]), (0, 0), "{counters:?}");
     let wait_s = rig.machine.usart(|usart| usart.longest_wait()).seconds();

@@ -1340,11 +1340,11 @@ fn our_driver_recovers_from_every_flip_that_the_checksum_shows() {
     let pairs: Vec<_> = bench.chip.transactions().iter().copied().collect();
     let mut detectable = 0;
     let mut blind = 0;
-    for pair in pairs.chunks_exact(2) {
-        assert_eq!((pair[0].register, pair[1].register), (AENERGY, CHKSUM));
-        if pair[0].seen.count_ones() != pair[1].seen {
+    for [data, checksum] in pairs.as_chunks().0 {
+        assert_eq!((data.register, checksum.register), (AENERGY, CHKSUM));
+        if data.seen.count_ones() != checksum.seen {
             detectable += 1;
-        } else if pair[0].seen != pair[0].sent {
+        } else if data.seen != data.sent {
             blind += 1;
         }
     }

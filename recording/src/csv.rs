@@ -182,7 +182,7 @@ fn separator(header: &str) -> u8 {
         !is_quoted
     };
     let outside: Vec<u8> = header.bytes().filter(outside).collect();
-    let separators = [b',', b';', b'\t'].into_iter();
+    let separators = (*b",;\t").into_iter();
     let mut found = separators.filter(|separator| outside.contains(separator));
     found.next().unwrap_or(b',')
 }
@@ -539,11 +539,11 @@ pub fn write(path: &Path, columns: &dyn Columns, progress: &mut dyn FnMut(f64)) 
     for first in (0..rows).step_by(BLOCK) {
         progress(first as f64 / rows as f64);
         let length = BLOCK.min(rows - first);
-        for (column, values) in block.chunks_exact_mut(BLOCK).enumerate() {
+        for (column, values) in block.as_chunks_mut::<BLOCK>().0.iter_mut().enumerate() {
             columns.fill(column, first, &mut values[..length]);
         }
         for index in 0..length {
-            for (value, values) in row.iter_mut().zip(block.chunks_exact(BLOCK)) {
+            for (value, values) in row.iter_mut().zip(block.as_chunks::<BLOCK>().0) {
                 *value = values[index];
             }
             writer.row(&row)?;

@@ -61,8 +61,10 @@ impl Window {
 pub fn noise(stretches: &[Vec<f64>]) -> Option<f64> {
     let windows = stretches
         .iter()
-        .flat_map(|stretch| stretch.chunks_exact(WINDOW));
-    let white = windows.map(Window::of).filter(Window::is_white);
+        .flat_map(|stretch| stretch.as_chunks::<WINDOW>().0);
+    let white = windows
+        .map(|window| Window::of(window))
+        .filter(Window::is_white);
     let variance = quietest(white.map(|window| window.variance).collect())?;
     let all = || stretches.iter().flatten();
     let count = all().count() as f64;

@@ -209,8 +209,10 @@ impl Program {
     fn scan(&mut self, code: &Code<'_>, constants: &mut BTreeSet<u32>) {
         let halfwords: Vec<u16> = code
             .bytes
-            .chunks_exact(2)
-            .filter_map(|pair| Some(u16::from_le_bytes(pair.try_into().ok()?)))
+            .as_chunks()
+            .0
+            .iter()
+            .map(|pair| u16::from_le_bytes(*pair))
             .collect();
         // Literal pools and jump tables.
         for (offset, word) in (0..).step_by(4).zip(words(code.bytes)) {
@@ -541,8 +543,10 @@ fn mapping(file: &object::File<'_>, start: u32, length: usize) -> Result<BTreeMa
 
 fn words(bytes: &[u8]) -> impl Iterator<Item = u32> + '_ {
     bytes
-        .chunks_exact(4)
-        .filter_map(|word| Some(u32::from_le_bytes(word.try_into().ok()?)))
+        .as_chunks()
+        .0
+        .iter()
+        .map(|word| u32::from_le_bytes(*word))
 }
 
 #[cfg(test)]

@@ -107,8 +107,10 @@ pub fn qemu(programs: &[u8], block: &[u32], name: &str) -> Results {
     assert!(status.success(), "QEMU ended with {status}");
     let words: Vec<u32> = fs::read(&printed)
         .unwrap()
-        .chunks_exact(4)
-        .map(|word| u32::from_le_bytes(word.try_into().unwrap()))
+        .as_chunks()
+        .0
+        .iter()
+        .map(|word| u32::from_le_bytes(*word))
         .collect();
     let count = words[0] as usize;
     let log = words[1..1 + count].to_vec();

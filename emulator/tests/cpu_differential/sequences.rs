@@ -98,8 +98,10 @@ fn slot(random: &mut Random) -> Vec<u32> {
     code.push(BX_LR);
     code.resize(CODE, BX_LR);
     words.extend(
-        code.chunks_exact(2)
-            .map(|pair| u32::from(pair[0]) | u32::from(pair[1]) << 16),
+        code.as_chunks()
+            .0
+            .iter()
+            .map(|[low, high]| u32::from(*low) | u32::from(*high) << 16),
     );
     words
 }

@@ -125,7 +125,7 @@ fn spectrum(plots: &SignalPlots) -> Vec<(f64, f64, f64)> {
         .map(|(r, s)| clean(r - s))
         .collect();
     let density = |series: &[f64], line: usize| {
-        let blocks = series.chunks_exact(BLOCK).take(8);
+        let blocks = series.as_chunks::<BLOCK>().0.iter().take(8);
         let count = blocks.len().max(1) as f64;
         let power: f64 = blocks
             .map(|block| {
