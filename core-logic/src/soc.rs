@@ -190,10 +190,15 @@ impl SocCoefficients {
         Nanocoulombs(self.capacity)
     }
 
+    /// A charge cut to what the battery holds. Not `clamp`, which panics where the end lies below the begin, as damage can make it.
+    fn within(&self, charge: i64) -> i64 {
+        charge.min(self.capacity).max(0)
+    }
+
     /// A charge as a share of the capacity: 0 … 1,000,000 ppm, never decreasing with the charge, within 0.51 ppm.
     #[must_use]
     pub fn share(&self, charge: Nanocoulombs) -> Ppm {
-        let inside = charge.get().clamp(0, self.capacity);
+        let inside = self.within(charge.get());
         // At most 10⁶ · 2⁴², which fits.
         let product = (inside >> self.shift) * self.reciprocal;
         Ppm(clamp_i32_inline(
@@ -370,7 +375,7 @@ impl Soc {
         let mut soc = Self::with(kept, Some(charge_total));
         soc.change_capacity(coefficients);
         for charge in [&mut soc.kept.remaining, &mut soc.kept.uncertainty] {
-            charge.0 = charge.get().clamp(0, coefficients.capacity);
+            charge.0 = coefficients.within(charge.get());
         }
         soc.keep_presented_inside(coefficients);
         soc
@@ -556,7 +561,7 @@ impl Soc {
                 self.slack = 0;
             }
         }
-        let limited = remaining.clamp(0, coefficients.capacity);
+        let limited = coefficients.within(remaining);
         if limited != remaining {
             self.clipped = add_i64(self.clipped, (remaining - limited).abs());
         }
@@ -574,8 +579,7 @@ impl Soc {
     fn keep_presented_inside(&mut self, coefficients: &SocCoefficients) {
         let remaining = self.kept.remaining.get();
         // What was restored may be any number.
-        let presented =
-            add_i64(remaining, self.kept.presented_offset.get()).clamp(0, coefficients.capacity);
+        let presented = coefficients.within(add_i64(remaining, self.kept.presented_offset.get()));
         self.kept.presented_offset.0 = presented - remaining;
     }
 
@@ -593,12 +597,8 @@ impl Soc {
     }
 
     fn grow_uncertainty(&mut self, coefficients: &SocCoefficients, by: i64) {
-        self.kept.uncertainty.0 = self
-            .kept
-            .uncertainty
-            .get()
-            .saturating_add(by)
-            .clamp(0, coefficients.capacity);
+        self.kept.uncertainty.0 =
+            coefficients.within(self.kept.uncertainty.get().saturating_add(by));
     }
 
     fn age(&mut self, coefficients: &SocCoefficients) {
@@ -683,7 +683,7 @@ impl Soc {
             );
             let blend = Blend::of(prior, table_width);
             let step = mul_div(sub_i64(target, before), blend.weight_ppm, 1_000_000);
-            self.kept.remaining.0 = add_i64(before, step).clamp(0, coefficients.capacity);
+            self.kept.remaining.0 = coefficients.within(add_i64(before, step));
             self.kept.uncertainty.0 = coefficients.charge_of(Ppm(clamp_i32(blend.width)));
             self.kept.presented_offset.0 = sub_i64(self.kept.presented_offset.get(), step);
             self.keep_presented_inside(coefficients);

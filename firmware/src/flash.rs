@@ -147,7 +147,8 @@ impl<SPI: SpiDevice> Flash<SPI> {
                 return Err(Error::OutOfBounds);
             };
             self.transfer(&command(READ, at), read)?;
-            if *read != *part {
+            // `!=` of two slices is `memcmp`, which nothing else needs: 130 bytes of the image.
+            if !read.iter().eq(part) {
                 return Err(Error::NotWritten);
             }
             at = at.saturating_add(u32::try_from(part.len()).unwrap_or(0));
@@ -221,7 +222,9 @@ impl<SPI: SpiDevice> NorFlash for Lent<'_, SPI> {
         while !left.is_empty() {
             // A program wraps within its page.
             let room = usize::try_from(PAGE - at % PAGE).unwrap_or(1);
-            let (now, later) = left.split_at(room.min(left.len()));
+            let Some((now, later)) = left.split_at_checked(room.min(left.len())) else {
+                return Err(Error::OutOfBounds);
+            };
             self.0.enable_write()?;
             self.0
                 .0

@@ -251,7 +251,8 @@ impl Storage {
         else {
             return Ok(None);
         };
-        let is_older = last_read != record;
+        // As in `Flash::compare`: `!=` would be `memcmp`.
+        let is_older = !last_read.iter().eq(record);
         if is_older {
             count(&mut self.counters.refused);
             self.failed = true;
