@@ -60,7 +60,7 @@ pub fn run(workspace: &Workspace) -> Result<bool> {
             match &elf {
                 Some(elf) => {
                     println!("   {}", elf.display());
-                    steps.step("size", || report::memory(elf, false));
+                    steps.step("size", || report::memory(elf, toolchain, false));
                 }
                 None => steps.skip("size", "there is no image"),
             }

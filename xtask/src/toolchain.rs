@@ -28,6 +28,9 @@ const DEBIAN_PACKAGES: [&str; 7] = [
     "rust-web-llvm",
     "binutils-arm-none-eabi",
 ];
+/// Minor number of the newest stable compiler, 1.x, that the checks have been run with. A newer one knows other lints and makes an
+/// image of another size, which is no fault of the code: what it says is shown, and fails nothing.
+const NEWEST_CHECKED: u32 = 99;
 /// A target download takes seconds; a network that answers nothing must not hold up a test run.
 const DOWNLOAD_LIMIT: Duration = Duration::from_secs(120);
 
@@ -37,6 +40,8 @@ pub struct Toolchain {
     root: PathBuf,
     target_dir: PathBuf,
     encoded_flags: OsString,
+    /// Whether the checks have been run with this compiler: a limit that follows from what it makes holds then.
+    pub is_checked: bool,
 }
 
 enum Origin {
@@ -145,6 +150,28 @@ fn own_rustc(workspace: &Workspace) -> Command {
     command
 }
 
+/// Whether the checks have been run with the host's compiler.
+pub fn host_is_checked(workspace: &Workspace) -> Result<bool> {
+    is_checked(&rustc_version(&mut own_rustc(workspace))?)
+}
+
+/// Of `rustc -vV`.
+fn is_checked(version: &str) -> Result<bool> {
+    let minor = version
+        .lines()
+        .find_map(|line| line.strip_prefix("release: 1.")?.split('.').next())
+        .and_then(|minor| minor.parse::<u32>().ok())
+        .with_context(|| format!("`rustc -vV` names no release 1.x: {version:?}"))?;
+    Ok(minor <= NEWEST_CHECKED)
+}
+
+/// Says that what follows does not fail a run.
+pub fn remark_unchecked(what: &str) {
+    println!(
+        "   the compiler is newer than 1.{NEWEST_CHECKED}, the newest that has been checked: {what}"
+    );
+}
+
 fn rustc_version(rustc: &mut Command) -> Result<String> {
     process::output(rustc.arg("-vV"))
 }
@@ -239,6 +266,7 @@ fn own(workspace: &Workspace) -> Result<Toolchain> {
         root: workspace.root.clone(),
         target_dir: workspace.target_dir.clone(),
         encoded_flags: encode(&path_flags(workspace)),
+        is_checked: host_is_checked(workspace)?,
     })
 }
 
@@ -254,6 +282,7 @@ fn debian(workspace: &Workspace) -> Result<Toolchain> {
         root: workspace.root.clone(),
         target_dir,
         encoded_flags: encode(&flags),
+        is_checked: is_checked(&debian_version()?)?,
     })
 }
 
@@ -310,8 +339,23 @@ fn write(path: &Path, text: &str) -> Result<()> {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_compiler_is_checked_up_to_the_newest_that_was_tried() {
+        let version = |release: &str| {
+            format!("rustc {release} (0123 2026-01-01)\nbinary: rustc\nrelease: {release}\n")
+        };
+        assert!(is_checked(&version("1.95.0")).unwrap());
+        assert!(is_checked(&version(&format!("1.{NEWEST_CHECKED}.1"))).unwrap());
+        assert!(!is_checked(&version(&format!("1.{}.0-nightly", NEWEST_CHECKED + 1))).unwrap());
+        for unreadable in ["", "release: ", "release: 2.0.0", "release: 1.x.0"] {
+            let error = is_checked(unreadable).unwrap_err().to_string();
+            assert!(error.contains("release"), "{error}");
+        }
+    }
 
     #[test]
     fn flags_keep_their_spaces() {
