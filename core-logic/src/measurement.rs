@@ -238,6 +238,9 @@ const _: () = assert!(
 );
 /// 1 ppm of the lowest supply in µV, rounded down: a difference in µV by it is a share in ppm, or more.
 const SUPPLY_PPM: i32 = design::SENSOR_SUPPLY_LOW.get() / 1_000_000;
+/// Longest time without a valid conversion through which the meter alone shows a rest, as long as one between two updates of the
+/// state of charge may be.
+const LONGEST_UNKNOWN: Duration = Duration::from_ticks(1_000_000);
 /// By then the meter counts with the factors that it is handed: a tick and a poll.
 const METER_FOLLOWS: Duration = Duration::from_ticks(50_000);
 /// Environment readings older than this are missing.
@@ -281,6 +284,8 @@ pub struct Measurement {
     /// The newest conversion was refused for its rate of change.
     rate_refused: bool,
     reading: CurrentReading,
+    /// When the meter's newest report found it valid.
+    current_known_at: Instant,
     open_sensor: OpenSensor,
     flag: FlagReport,
     flag_plausibility: FlagPlausibility,
@@ -506,6 +511,7 @@ impl Measurement {
             refused_steps: 0,
             rate_refused: false,
             reading: Converter::new().reading(&prepared.converter, now),
+            current_known_at: now,
             average: SlidingAverage::new(),
             open_sensor: OpenSensor::new(),
             flag: FlagReport::default(),
@@ -770,19 +776,24 @@ impl Measurement {
             self.soc.declare_loss(&self.prepared.soc, doubt);
         }
         let now = report.at.unwrap_or(self.now);
-        // No rest by a current that is doubted, nor against the other channel. (A calibration doubts none at rest.)
+        // No rest by a current that is doubted, nor against the other channel. (A calibration doubts none at rest.) For a while the
+        // meter alone will do: a conversion is lost now and then.
+        let mean = self.meter_mean();
+        let current = if self.reading.validity.and(self.effects.current).is_valid() {
+            self.current_known_at = now;
+            Some(self.reading.current)
+        } else {
+            mean.filter(|_| elapsed(self.current_known_at, now) <= LONGEST_UNKNOWN)
+        };
         let rest_current = configuration.soc.rest_current;
-        let is_known = self.reading.validity.and(self.effects.current).is_valid()
-            && self
-                .meter_mean()
-                .is_none_or(|mean| mean.saturating_abs() <= rest_current);
+        let is_against = mean.is_some_and(|mean| mean.saturating_abs() > rest_current);
         self.soc.update(
             &self.prepared.soc,
             &configuration.ocv,
             &SocInput {
                 now,
                 charge_total: report.charge_total,
-                current: is_known.then_some(self.reading.current),
+                current: current.filter(|_| !is_against),
                 cell_voltage: self.cell_voltage,
             },
         );

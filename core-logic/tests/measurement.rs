@@ -21,7 +21,7 @@ use core_logic::diagnosis::{Code, CodeSet};
 use core_logic::error_budget::{ProfileSummary, charge_bound};
 use core_logic::front_end::KeyFactors;
 use core_logic::key_calibration::KeyPhase;
-use core_logic::measurement::{Measurement, Order, Refusal, Tick, Vehicle};
+use core_logic::measurement::{ConverterFault, Measurement, Order, Refusal, Tick, Vehicle};
 use core_logic::meter::MeterReport;
 use core_logic::modbus::Readings;
 use core_logic::open_sensor::network_output_open;
@@ -325,6 +325,46 @@ fn soc_follows_the_charge_and_is_anchored_after_a_rest() {
         (anchored - left - 100_000).abs() < 300,
         "{anchored} → {left}"
     );
+}
+
+/// When the state of charge is valid, at rest from the start and with the converter silent for so long 10, 20 and 30 s after it.
+fn anchored_s(silent_us: Option<u64>) -> f64 {
+    let mut configuration = Configuration::default();
+    configuration.soc.capacity_mah = 1_000;
+    configuration.soc.rest_time_s = 60;
+    configuration.soc.stability_window_s = 20;
+    let rows = rows(&[(0.0, 0.0), (200.0, 0.0)]);
+    let mut board = HostBoard::new(&rows, Timing::default(), configuration);
+    for begin_us in [10_000_000, 20_000_000, 30_000_000] {
+        let Some(silent_us) = silent_us else { break };
+        assert!(board.run_until(|board| board.now_us >= begin_us));
+        while board.now_us <= begin_us + silent_us {
+            let at = Instant::from_ticks(board.now_us);
+            board
+                .measurement
+                .on_converter_fault(ConverterFault::NoAnswer, at);
+            assert!(!board.measurement.current().validity.is_valid());
+            board.step();
+        }
+    }
+    assert!(board.run_until(|board| board.measurement.state_of_charge().validity.is_valid()));
+    board.world.elapsed_s()
+}
+
+/// A conversion that is lost now and then leaves a rest be; a converter that is silent for longer than a second ends it, for the
+/// meter alone does not show one.
+#[test]
+fn a_lost_conversion_ends_no_rest_and_a_silent_converter_does() {
+    let undisturbed = anchored_s(None);
+    assert!(undisturbed >= 60.0, "{undisturbed} s");
+    for (silent_us, later_s) in [(0, 0.0), (300_000, 0.0), (1_200_000, 31.2)] {
+        let later = anchored_s(Some(silent_us)) - undisturbed;
+        // A rest is looked at once a second.
+        assert!(
+            (later - later_s).abs() <= 1.0,
+            "silent for {silent_us} µs: {later} s later"
+        );
+    }
 }
 
 /// A supply outside its limits invalidates everything that hangs on it, and says so.
