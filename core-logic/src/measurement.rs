@@ -217,8 +217,8 @@ pub struct Tick {
     pub changes: Changes,
 }
 
-/// The supply is averaged over 32 readings: one code of ADC1 is 1.6 mV of a 5 V supply, and one of its reference, which stands for
-/// two readings, 3.3 mV. Of 1 code of noise (rms) that leaves 3.3 mV · √(1/31) and 1.6 mV · √(1/63): 0.63 mV.
+/// The supply is averaged over 32 readings: one code of ADC1 is 1.6 mV of a 5 V supply, and one of its reference, averaged over 16
+/// before, 3.3 mV. Of 1 code of noise (rms) that leaves less than 3.3 mV · √(1/31) and 1.6 mV · √(1/63): 0.63 mV.
 const SUPPLY_READINGS: i32 = 32;
 /// New factors are worked out for a mean that has moved so far: 0.06 % of the meter's scale, of the 0.1 % that
 /// [`design::SUPPLY_RESIDUAL`] allows. The noise above, 4.8 times less, moves no further in minutes.
@@ -230,7 +230,7 @@ const _: () = assert!(SUPPLY_STEP.get() / 5 < design::SUPPLY_RESIDUAL.get());
 const SUPPLY_JUMP: Microvolts = Microvolts::from_millivolts(25);
 const SUPPLY_CONFIRMATIONS: u8 = 3;
 /// A reading further than this from what the factors are of widens what the channels may differ by. Twice the 0.1 % that the
-/// tolerances have in them, 2.7 times the rms noise of one reading.
+/// tolerances have in them, 5.9 times the rms noise of one reading: √(1.6² + 3.3² / 31) mV.
 const SUPPLY_DOUBT: Microvolts = Microvolts::from_millivolts(10);
 const _: () = assert!(
     SUPPLY_DOUBT.get() as i64 * 1_000_000
@@ -781,7 +781,8 @@ impl Measurement {
         let mean = self.meter_mean();
         let current = if self.reading.validity.and(self.effects.current).is_valid() {
             self.current_known_at = now;
-            Some(self.reading.current)
+            // A single reading of ADC1 (D3) is too noisy for it.
+            Some(self.averaged(configuration).0)
         } else {
             mean.filter(|_| elapsed(self.current_known_at, now) <= LONGEST_UNKNOWN)
         };

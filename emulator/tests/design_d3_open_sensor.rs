@@ -153,6 +153,42 @@ fn open_sensor_is_found_within_two_readings_and_no_legal_level_is_taken_for_one(
     assert!((amps - 100.0).abs() < 1.0, "{amps} A");
 }
 
+/// ADC1 with a code of noise, rms: 0.45 A of each conversion of the network and 0.61 A of each of the reference.
+#[test]
+fn a_noisy_converter_is_averaged_and_still_calibrated() {
+    let firmware = firmware();
+    let mut bench = network_board(&firmware, NetworkConfig::default());
+    bench.rig.machine.adc(|adc| adc.set_noise_codes(1.0));
+    // Key OFF, as for a calibration; the battery settles within seconds.
+    bench.vehicle(at_rest().with_key(Key::Off));
+    bench.run(2.0);
+    bench.set("capacity", &[1_000]);
+    bench.set("stability window", &[10]);
+    bench.set("rest time", &[60]);
+    // What such noise makes of 64 readings, highest less lowest: 5 times the deviation that is left, and more now and then.
+    bench.set("zero drift: spread", &[2_000_000, 500_000]);
+
+    bench.record();
+    bench.run(10.0);
+    let readings: Vec<f64> = bench
+        .conversions()
+        .iter()
+        .map(|frame| frame.current_a.unwrap())
+        .collect();
+    let count = readings.len() as f64;
+    let mean = readings.iter().sum::<f64>() / count;
+    let deviation_a =
+        (readings.iter().map(|a| (a - mean).powi(2)).sum::<f64>() / (count - 1.0)).sqrt();
+    println!("D3: {deviation_a:.3} A rms of {count} readings, mean {mean:+.3} A");
+    assert!(count > 900.0, "{count}");
+    assert!(deviation_a <= 0.3, "{deviation_a} A");
+
+    assert_eq!(bench.command("zero now", 3.0), Ended::Done);
+    // A reading of more than the 1 A of `rest current` would have ended the rest: at 100 readings a second there are 6,000.
+    bench.run(65.0);
+    assert_eq!(bench.input("anchorings"), 1);
+}
+
 #[test]
 fn without_the_pull_down_an_open_sensor_reads_like_a_current() {
     let firmware = firmware();
