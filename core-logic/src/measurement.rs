@@ -236,6 +236,9 @@ const _: () = assert!(
     SUPPLY_DOUBT.get() as i64 * 1_000_000
         == 2 * design::SUPPLY_RESIDUAL.get() as i64 * design::SENSOR_NOMINAL_SUPPLY.get() as i64
 );
+/// A reading further than this from the mean says that the network cannot be judged by it: from the end of the small sensor's range
+/// to halfway to its supply are 112 mV of 4.5 V. The network of D3's own sensor does not hang on it.
+const NETWORK_SUPPLY_DOUBT: Microvolts = Microvolts::from_millivolts(100);
 /// 1 ppm of the lowest supply in µV, rounded down: a difference in µV by it is a share in ppm, or more.
 const SUPPLY_PPM: i32 = design::SENSOR_SUPPLY_LOW.get() / 1_000_000;
 /// Longest time without a valid conversion through which the meter alone shows a rest, as long as one between two updates of the
@@ -713,13 +716,18 @@ impl Measurement {
         let Some(network) = environment.network else {
             return;
         };
-        self.open_sensor.on_network(
-            &configuration.open_sensor,
-            &self.prepared.open_sensor,
-            network,
-            now,
-        );
-        if self.prepared.converter.channel() == Channel::Adc1 {
+        let is_adc1 = self.prepared.converter.channel() == Channel::Adc1;
+        // A sensor at the end of its range follows a supply that has just jumped, the thresholds those of the mean.
+        let mean = self.supply.unwrap_or(self.newest_supply);
+        if is_adc1 || !is_beyond(self.newest_supply, mean, NETWORK_SUPPLY_DOUBT) {
+            self.open_sensor.on_network(
+                &configuration.open_sensor,
+                &self.prepared.open_sensor,
+                network,
+                now,
+            );
+        }
+        if is_adc1 {
             let sample = Adc1Sample {
                 started: now,
                 finished: now,

@@ -16,7 +16,7 @@ mod host_board;
 mod ideal_board;
 
 use core_logic::configuration::Configuration;
-use core_logic::converter::SupplyMode;
+use core_logic::converter::{DataRate, SupplyMode};
 use core_logic::diagnosis::{Code, CodeSet};
 use core_logic::error_budget::{ProfileSummary, charge_bound};
 use core_logic::front_end::KeyFactors;
@@ -522,7 +522,15 @@ fn supplies() -> Vec<(&'static str, bool, Supply)> {
         let mixed = (reading + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40;
         5.0 + 0.06 * (mixed as f64 / f64::from(1 << 23) - 1.0)
     };
+    let steps = |low_v: f64, high_v: f64| -> Supply {
+        Box::new(
+            move |reading| {
+                if reading / 97 % 2 == 0 { low_v } else { high_v }
+            },
+        )
+    };
     vec![
+        ("steps", true, steps(4.9, 5.1)),
         ("every other reading", false, every(2, 5.06)),
         ("every fifth reading", false, every(5, 4.9)),
         ("any", false, Box::new(any)),
@@ -585,14 +593,32 @@ fn under_a_supply_that_moves_a_fault_is_found_all_the_same() {
 
 #[test]
 fn a_supply_that_moves_is_no_fault_of_the_channels() {
-    let rows = us06(300.0);
+    assert_agreement(&us06(300.0), Timing::default(), Configuration::default());
+}
+
+/// 8 SPS by the slowest clock that is waited for, half as long again; a current that hides nothing of the supply.
+#[test]
+fn a_supply_that_moves_is_no_fault_of_the_channels_with_a_slow_converter() {
+    let mut configuration = Configuration::default();
+    configuration.converter.data_rate = DataRate::Sps8;
+    let timing = Timing {
+        conversion_s: 0.1875,
+        codes: 32_768.0,
+        ..Timing::default()
+    };
+    let rows = rows(&[(0.0, 50.0), (60.0, 50.0)]);
+    assert_agreement(&rows, timing, configuration);
+}
+
+#[track_caller]
+fn assert_agreement(rows: &[Row], timing: Timing, configuration: Configuration) {
     for (name, _, supply) in supplies() {
         for own_reference in [false, true] {
-            let mut configuration = Configuration::default();
+            let mut configuration = configuration;
             if own_reference {
                 configuration.converter.supply_mode = SupplyMode::Measured;
             }
-            let mut board = HostBoard::new(&rows, Timing::default(), configuration);
+            let mut board = HostBoard::new(rows, timing, configuration);
             board.world.own_reference = own_reference;
             run_on_supply(&mut board, &supply, |board, tick| {
                 let raised: Vec<_> = tick.changes.set.iter().collect();
