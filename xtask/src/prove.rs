@@ -52,7 +52,8 @@ pub fn run(
 pub fn quick(workspace: &Workspace, image: &Path, python: &Path) -> Result<()> {
     apt::program(NGSPICE)?;
     let mut build = workspace.cargo();
-    build.args(["build", "--quiet", "--all-features"]);
+    // With the tests beside them they have the features that the tests were built with: else they would all be built anew.
+    build.args(["build", "--quiet", "--all-features", "--bins", "--tests"]);
     process::run(&mut build).context("building the host programs")?;
     let folder = workspace.target_dir.join("debug");
     let mut prove = Command::new(folder.join("prove"));
