@@ -40,7 +40,7 @@ use crate::range::{
 };
 use crate::retained::{LogRecord, RetainedState};
 use crate::sliding_average::{Average, SlidingAverage};
-use crate::soc::{CellVoltage, Soc, SocCoefficients, SocInput, SocReading};
+use crate::soc::{CellVoltage, LONGEST_UNSEEN_REST, Soc, SocCoefficients, SocInput, SocReading};
 use crate::supply_calibration::{Run, SupplyCalibration, SupplyPoint};
 use crate::units::{
     Duration, Instant, Microamps, Microvolts, MilliCelsius, Millivolts, Nanocoulombs, Ppm, add_i64,
@@ -241,9 +241,6 @@ const _: () = assert!(
 const NETWORK_SUPPLY_DOUBT: Microvolts = Microvolts::from_millivolts(100);
 /// 1 ppm of the lowest supply in µV, rounded down: a difference in µV by it is a share in ppm, or more.
 const SUPPLY_PPM: i32 = design::SENSOR_SUPPLY_LOW.get() / 1_000_000;
-/// Longest time without a valid conversion through which the meter alone shows a rest, as long as one between two updates of the
-/// state of charge may be.
-const LONGEST_UNKNOWN: Duration = Duration::from_ticks(1_000_000);
 /// By then the meter counts with the factors that it is handed: a tick and a poll.
 const METER_FOLLOWS: Duration = Duration::from_ticks(50_000);
 /// Environment readings older than this are missing.
@@ -792,7 +789,7 @@ impl Measurement {
             // A single reading of ADC1 (D3) is too noisy for it.
             Some(self.averaged(configuration).0)
         } else {
-            mean.filter(|_| elapsed(self.current_known_at, now) <= LONGEST_UNKNOWN)
+            mean.filter(|_| elapsed(self.current_known_at, now) <= LONGEST_UNSEEN_REST)
         };
         let rest_current = configuration.soc.rest_current;
         let is_against = mean.is_some_and(|mean| mean.saturating_abs() > rest_current);

@@ -49,8 +49,8 @@ pub const CAPACITY_LIMITS_MAH: (u32, u32) = (1, 2_000_000);
 /// Uncertainty and rest are worked out this often, the charge at every call.
 const SLOW_STEP_US: u64 = 1_000_000;
 
-/// Longest time between two updates through which a rest is believed to last.
-const LONGEST_UNSEEN_REST: Duration = Duration::from_ticks(1_000_000);
+/// Longest time between two updates, or without a valid conversion, through which a rest is believed to last.
+pub(crate) const LONGEST_UNSEEN_REST: Duration = Duration::from_ticks(1_000_000);
 
 /// Largest difference of the counter that is charge: 320,000 Ah. It keeps the sums below inside 64 bits.
 const LARGEST_DIFFERENCE: u64 = 1 << 60;
