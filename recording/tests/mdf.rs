@@ -178,6 +178,37 @@ fn mixed_groups_and_values_of_variable_length() {
     assert_eq!(contents.series[0].signals[0].values, [3.5, 3.25]);
 }
 
+/// Where a text of the file is, and where the body of the channel that it names: the block after it.
+fn named(file: &[u8], name: &str) -> (usize, usize) {
+    let find = |what: &[u8], from: usize| {
+        let found = file[from..].windows(what.len()).position(|at| at == what);
+        from + found.unwrap()
+    };
+    let text = find(format!("{name}\0").as_bytes(), 64);
+    (text, find(b"##CN", text) + 24 + 8 * 8)
+}
+
+/// Longer than any number, with a bit offset beside which its length does not fit 32 bits.
+#[test]
+fn the_parts_of_a_logged_frame_are_numbers() {
+    for (part, bits) in [
+        ("ID", u32::MAX),
+        ("IDE", 65),
+        ("DataLength", 0),
+        ("DataBytes", u32::MAX),
+    ] {
+        let mut file = mixed();
+        let name = format!("CAN_DataFrame.{part}");
+        let (_, channel) = named(&file, &name);
+        file[channel + 3] = 7;
+        file[channel + 8..channel + 12].copy_from_slice(&bits.to_le_bytes());
+        let error = mdf::read("m.mf4", None, &file).unwrap_err();
+        assert_eq!(error.kind(), Kind::Format);
+        let expected = format!(": found \"{name}\" of {bits} bits, expected 1 to 64");
+        assert!(error.to_string().ends_with(&expected), "{error}");
+    }
+}
+
 /// Bits of a number anywhere in a record, and a name that two groups share.
 fn measured(byte: u32, bit: u8, bits: u32, data_type: u32, records: &[[u8; 20]]) -> Vec<u8> {
     let mut maker = Maker::new();
@@ -216,6 +247,16 @@ fn an_infinite_value_is_no_value_of_a_recording() {
     // What is not a number is missing.
     let contents = mdf::read("m.mf4", None, &measured(8, 0, 32, FLOAT, &records[..2])).unwrap();
     assert!(contents.series[0].signals[0].values[1].is_nan());
+}
+
+#[test]
+fn a_channel_without_a_name_is_left_out() {
+    let mut file = measured(8, 0, 8, UNSIGNED, &[[0; 20]]);
+    let (name, _) = named(&file, "x");
+    file[name] = 0;
+    let contents = mdf::read("m.mf4", None, &file).unwrap();
+    assert_eq!(contents.left_out, ["a channel of group (no name)"]);
+    assert_eq!(contents.series[0].signals[0].name, "x");
 }
 
 #[test]
@@ -309,6 +350,62 @@ fn data_that_is_listed_twice_is_damage() {
             .ends_with("found a block twice in a list of data, expected each block once"),
         "{error}"
     );
+}
+
+/// In ns they would all be the same.
+#[test]
+fn times_are_of_less_than_292_years() {
+    let mut records = [[0; 20]; 2];
+    records[1][..8].copy_from_slice(&1e10_f64.to_le_bytes());
+    let error = mdf::read("m.mf4", None, &measured(8, 0, 8, UNSIGNED, &records)).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "m.mf4, row 2, column group: t: found 10000000000 s, expected a time of less than 292 years"
+    );
+}
+
+fn linked_again(file: &[u8]) {
+    let error = mdf::read("m.mf4", None, file).unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .ends_with("found data that are linked again and again, expected each once"),
+        "{error}"
+    );
+}
+
+/// Each block of a list reaches to the end of the last one: 50 MB in 64 kB, and 5 GB in ten times that.
+#[test]
+fn data_blocks_inside_of_each_other_are_damage() {
+    const BLOCKS: u64 = 2_000;
+    let mut maker = Maker::new();
+    let time = maker.channel(0, 0, "t", 0, [MASTER, 1, FLOAT, 0, 64]);
+    let group = maker.group(0, time, [0, 2, 0, 8]);
+    let blocks: Vec<u64> = (0..BLOCKS)
+        .map(|block| {
+            let inside = vec![0; 24 * (BLOCKS - 1 - block) as usize];
+            let address = maker.block("DT", &[], &inside);
+            maker.0.truncate(address as usize + 24);
+            address
+        })
+        .collect();
+    let links = [vec![0], blocks].concat();
+    let list = maker.block("DL", &links, &[0; 16]);
+    let data_group = maker.block("DG", &[0, group, list, 0], &[0; 8]);
+    linked_again(&maker.finish(data_group));
+}
+
+#[test]
+fn data_that_many_groups_share_are_damage() {
+    let mut maker = Maker::new();
+    let time = maker.channel(0, 0, "t", 0, [MASTER, 1, FLOAT, 0, 64]);
+    let group = maker.group(0, time, [0, 2, 0, 8]);
+    let data = maker.block("DT", &[], &[0; 10_000]);
+    let mut next = 0;
+    for _ in 0..3 {
+        next = maker.block("DG", &[next, group, data, 0], &[0; 8]);
+    }
+    linked_again(&maker.finish(next));
 }
 
 #[test]

@@ -22,6 +22,8 @@ pub struct File<'a> {
     pub bytes: &'a [u8],
     /// Channels read so far.
     pub channels: Cell<usize>,
+    /// Bytes of data read so far, packed as they are.
+    pub stored: Cell<usize>,
 }
 
 /// A block: its links, and the data after them.
@@ -122,6 +124,20 @@ impl<'a> File<'a> {
         ))
     }
 
+    /// The data of one more block are read. They are in the file once: what is more than it has room for is linked from
+    /// many places, or lies in blocks one inside of the other.
+    fn count_data(&self, block: &Block<'_>) -> Result<()> {
+        self.stored.set(self.stored.get() + block.data.len());
+        if self.stored.get() <= self.bytes.len() {
+            return Ok(());
+        }
+        Err(self.fault(
+            block.address,
+            "data that are linked again and again",
+            "each once",
+        ))
+    }
+
     /// The text of a TX block, or the text inside an MD block's XML.
     pub fn text(&self, address: Option<u64>) -> Result<String> {
         let Some(address) = address else {
@@ -148,7 +164,10 @@ impl<'a> File<'a> {
         };
         let block = self.block(address)?;
         match &block.id {
-            b"DT" | b"SD" => Ok(Cow::Borrowed(block.data)),
+            b"DT" | b"SD" => {
+                self.count_data(&block)?;
+                Ok(Cow::Borrowed(block.data))
+            }
             b"DZ" => self.unpacked(&block).map(Cow::Owned),
             b"HL" => self.list(block.link(0)).map(Cow::Owned),
             b"DL" => self.list(Some(address)).map(Cow::Owned),
@@ -174,7 +193,10 @@ impl<'a> File<'a> {
                 }
                 let block = self.block(address)?;
                 match &block.id {
-                    b"DT" | b"SD" => data.extend_from_slice(block.data),
+                    b"DT" | b"SD" => {
+                        self.count_data(&block)?;
+                        data.extend_from_slice(block.data);
+                    }
                     b"DZ" => data.extend(self.unpacked(&block)?),
                     _ => {
                         return Err(self.unsupported(
@@ -192,6 +214,7 @@ impl<'a> File<'a> {
     /// The data of a DZ block: its kind, the way of packing and its parameter, the length before and after.
     fn unpacked(&self, block: &Block<'_>) -> Result<Vec<u8>> {
         const FIELDS: usize = 24;
+        self.count_data(block)?;
         let Some((fields, packed)) = block.data.split_at_checked(FIELDS) else {
             return Err(self.fault(block.address, "a cut block DZ", "24 bytes and its data"));
         };

@@ -14,12 +14,14 @@ use blocks::{Block, File, u16_at, u32_at, u64_at};
 use conversion::Conversion;
 
 use crate::{
-    error::{Error, Kind, Place, Result, quoted},
+    error::{Error, Kind, Place, Result, number, quoted},
     log::{self, CLASSIC_BYTES, Counts, DATA_BYTES, Frame, Sink},
     merge::{Series, Signal},
     unit::{self, Unit},
 };
 
+/// No time is so far from its zero: in ns it fits 64 bits, and between any two of them is a number.
+const LONGEST_S: f64 = 9.2e9;
 /// The block HD follows the identification.
 const HD_ADDRESS: u64 = 64;
 
@@ -82,6 +84,7 @@ pub fn read(source: &str, wanted: Option<&str>, bytes: &[u8]) -> Result<Contents
         source,
         bytes,
         channels: Cell::new(0),
+        stored: Cell::new(0),
     };
     if bytes.starts_with(b"UnFinMF ") {
         return Err(file.unsupported(0, "a measurement that was not ended", "a finished file"));
@@ -337,6 +340,18 @@ impl<'a> Channel<'a> {
         self.data_type <= 3
     }
 
+    /// Refuses a part of a logged frame that is longer than a number can be.
+    fn need_number(&self, file: &File<'_>) -> Result<()> {
+        if (1..=64).contains(&self.bits) {
+            return Ok(());
+        }
+        Err(file.fault(
+            self.block.address,
+            &format!("{} of {} bits", quoted(&self.name), self.bits),
+            "1 to 64",
+        ))
+    }
+
     /// The raw bits in a record; the identifier of the record is not part of it.
     fn raw_bits(&self, record: &[u8]) -> Option<u64> {
         let bytes = (self.bit_offset + self.bits).div_ceil(8) as usize;
@@ -443,6 +458,12 @@ impl Group<'_> {
             if std::ptr::eq(channel, time) {
                 continue;
             }
+            if channel.name.is_empty() {
+                contents
+                    .left_out
+                    .push(format!("a channel of {name} (no name)"));
+                continue;
+            }
             let unit = channel.unit(file)?;
             if let Some(why) = channel.no_number() {
                 contents.left_out.push(format!("{} ({why})", channel.name));
@@ -538,6 +559,13 @@ impl Group<'_> {
             if !now_s.is_finite() {
                 return fault(Kind::TimeMissing, "no time".into(), "a time in s".into());
             }
+            if now_s.abs() > LONGEST_S {
+                return fault(
+                    Kind::Format,
+                    format!("{} s", number(now_s)),
+                    "a time of less than 292 years".into(),
+                );
+            }
             if now_s < last_s {
                 return fault(
                     Kind::TimeBackwards,
@@ -563,6 +591,7 @@ impl Group<'_> {
             // As of frames without this channel.
             return Ok(self.records.len() as u64 * log::on(wanted, "0"));
         };
+        bus.need_number(file)?;
         self.records().try_fold(0, |count, (record, _)| {
             let number = bus.raw_bits(record).ok_or_else(|| outside(file, bus))?;
             Ok(count + log::on(wanted, &number.to_string()))
@@ -592,6 +621,10 @@ impl Group<'_> {
         let counted = member("DataLength");
         let length = counted.map_or_else(|| need("DLC"), Ok)?;
         let (ide, edl, bus) = (member("IDE"), member("EDL"), member("BusChannel"));
+        let numbers = [Some(id), Some(length), ide, edl, bus];
+        for channel in numbers.into_iter().flatten() {
+            channel.need_number(file)?;
+        }
         let payload = Payload::of(file, bytes, &self.variable)?;
         let number = |channel: &Channel<'_>, record: &[u8]| {
             let bits = channel.raw_bits(record);
@@ -640,7 +673,7 @@ impl Group<'_> {
                 .and_then(|bytes| bytes.get(..length))
                 .ok_or_else(|| outside(file, bytes))?;
             data[..length].copy_from_slice(bytes);
-            #[expect(clippy::cast_possible_truncation, reason = "saturates")]
+            #[expect(clippy::cast_possible_truncation, reason = "no time is longer")]
             let time_ns = (time_s * 1e9).round() as i64;
             contents.frames.0.push(Logged {
                 time_ns,
@@ -695,6 +728,7 @@ impl<'a> Payload<'a> {
                 length: (channel.bits / 8) as usize,
             });
         }
+        channel.need_number(file)?;
         let address = channel.block.link(5);
         let values = match address.and_then(|address| variable.get(&address)) {
             Some(values) => Cow::Borrowed(values.as_slice()),
