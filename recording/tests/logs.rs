@@ -432,6 +432,40 @@ fn vector_binary_faults_have_their_place() {
     }
 }
 
+/// An object of 16 MiB that never ends, then 20,000 containers of four bytes: copied for each of them it was 320 GB.
+#[test]
+fn a_long_object_in_small_pieces_is_not_copied_for_each() {
+    const LENGTH: u32 = 1 << 24;
+    let container = |packed: &[u8], length: u32, method: u16| {
+        let mut object = b"LOBJ".to_vec();
+        object.extend([16, 0, 1, 0]);
+        object.extend((32 + packed.len() as u32).to_le_bytes());
+        object.extend(10_u32.to_le_bytes());
+        object.extend(method.to_le_bytes());
+        object.extend([0; 6]);
+        object.extend(length.to_le_bytes());
+        object.extend([0; 4]);
+        object.extend(packed);
+        object.resize(object.len() + packed.len() % 4, 0);
+        object
+    };
+    let mut long = b"LOBJ".to_vec();
+    long.extend([32, 0, 1, 0]);
+    long.extend((2 * LENGTH).to_le_bytes());
+    long.resize(LENGTH as usize, 0);
+    let mut encoder = ZlibEncoder::new(Vec::new(), Compression::fast());
+    encoder.write_all(&long).unwrap();
+    let mut log = b"LOGG".to_vec();
+    log.extend(144_u32.to_le_bytes());
+    log.resize(144, 0);
+    log.extend(container(&encoder.finish().unwrap(), LENGTH, 2));
+    for _ in 0..20_000 {
+        log.extend(container(&[0; 4], 4, 0));
+    }
+    let (frames, counts) = read(BLF, &log).unwrap();
+    assert_eq!((frames.len(), counts.cut), (0, 1));
+}
+
 #[test]
 fn frames_of_can_fd_have_up_to_64_bytes() {
     let bytes: Vec<u8> = (0..64).collect();

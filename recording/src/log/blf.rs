@@ -220,7 +220,7 @@ struct Objects<'a> {
 
 impl Objects<'_> {
     fn run(&mut self, offset: u64, sink: &mut Sink<'_>) -> Result<()> {
-        let pending = std::mem::take(&mut self.pending);
+        let mut pending = std::mem::take(&mut self.pending);
         let mut position = 0;
         loop {
             let rest = &pending[position..];
@@ -249,7 +249,9 @@ impl Objects<'_> {
             self.object(offset, object, sink)?;
             position += padding + size;
         }
-        self.pending = pending[position..].to_vec();
+        // Nothing moves while a long object is not whole yet, whatever small pieces it comes in.
+        pending.drain(..position);
+        self.pending = pending;
         Ok(())
     }
 
