@@ -3,7 +3,7 @@
 
 use std::{
     fs,
-    io::Write,
+    io::{self, Read, Write},
     panic::{self, AssertUnwindSafe},
     path::Path,
     sync::Arc,
@@ -17,12 +17,12 @@ use ::parquet::{
     file::{
         metadata::ColumnChunkMetaData,
         properties::WriterProperties,
-        reader::{FileReader, SerializedFileReader},
+        reader::{ChunkReader, FileReader, Length, SerializedFileReader},
         writer::SerializedFileWriter,
     },
     schema::types::{ColumnDescriptor, Type},
 };
-use bytes::Bytes;
+use bytes::{Buf, Bytes, buf};
 
 use crate::{
     error::{Error, Kind, Place, Result, quoted},
@@ -68,7 +68,7 @@ fn parse_or_panic(source: &str, bytes: Vec<u8>) -> Result<Table> {
         )
     };
     let size = bytes.len();
-    let file = SerializedFileReader::new(Bytes::from(bytes)).map_err(refused)?;
+    let file = SerializedFileReader::new(Whole(Bytes::from(bytes))).map_err(refused)?;
     let schema = file.metadata().file_metadata().schema_descr();
     let mut columns: Vec<(String, Vec<f64>)> = Vec::new();
     let (mut positions, mut left_out) = (Vec::new(), Vec::new());
@@ -158,6 +158,40 @@ fn parse_or_panic(source: &str, bytes: Vec<u8>) -> Result<Table> {
         return Err(first.error.clone());
     }
     Ok(Table::new(source, columns)?.with_left_out(&positions, left_out))
+}
+
+/// A file in memory whose end is an error to who reads beyond it. The crate skips what it does not know in a page's header and
+/// takes the end for skipped: a list of 2^31 numbers of which there is none takes minutes.
+struct Whole(Bytes);
+
+/// See [`Whole`].
+struct Rest(buf::Reader<Bytes>);
+
+impl Length for Whole {
+    fn len(&self) -> u64 {
+        Length::len(&self.0)
+    }
+}
+
+impl ChunkReader for Whole {
+    type T = Rest;
+
+    fn get_read(&self, start: u64) -> std::result::Result<Rest, ParquetError> {
+        self.0.get_read(start).map(Rest)
+    }
+
+    fn get_bytes(&self, start: u64, length: usize) -> std::result::Result<Bytes, ParquetError> {
+        self.0.get_bytes(start, length)
+    }
+}
+
+impl Read for Rest {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        if !buffer.is_empty() && !self.0.get_ref().has_remaining() {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        self.0.read(buffer)
+    }
 }
 
 /// Whether a column's piece lies inside of a file of `size` bytes: the reader takes that for granted.
@@ -319,6 +353,18 @@ pub fn write(path: &Path, columns: &dyn Columns, progress: &mut dyn FnMut(f64)) 
         )
     };
     let names = columns.names();
+    if let Some(column) = names.iter().position(|name| name.is_empty()) {
+        return Err(Error::new(
+            Kind::ColumnName,
+            path.display().to_string(),
+            Place {
+                column: Some(column + 1),
+                ..Place::default()
+            },
+            "a column without a name",
+            "a name for each column",
+        ));
+    }
     let fields = names.iter().map(|name| {
         let field = Type::primitive_type_builder(name, Physical::DOUBLE);
         field

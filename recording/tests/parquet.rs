@@ -5,7 +5,7 @@
 use std::fs;
 
 use proptest::prelude::*;
-use recording::{Mapping, Table, convert, error::Kind, parquet};
+use recording::{Mapping, Table, convert, error::Kind, output::Columns, parquet};
 
 fn any_number() -> impl Strategy<Value = f64> {
     any::<u64>().prop_map(|bits| {
@@ -92,6 +92,50 @@ fn what_is_no_number_is_placed() {
     assert!(
         error.to_string().starts_with("r.parquet: found "),
         "{error}"
+    );
+}
+
+/// The header of the first page begins with a field that nobody knows: a list of 2^31 - 1 doubles, of which the file has none.
+#[test]
+fn a_list_without_an_end_in_a_page_is_damage() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("out.parquet");
+    convert::write(&path, &table(&[(0.0, 1.0)]), &mut |_| {}).unwrap();
+    let mut bytes = fs::read(&path).unwrap();
+    bytes[4..11].copy_from_slice(&[0xF9, 0xF7, 0xFF, 0xFF, 0xFF, 0xFF, 0x07]);
+    let error = parquet::parse("r.parquet", bytes).unwrap_err();
+    assert_eq!(error.kind(), Kind::Format, "{error}");
+}
+
+/// A column without a name.
+struct Nameless;
+
+impl Columns for Nameless {
+    fn names(&self) -> Vec<&str> {
+        vec!["t_s", ""]
+    }
+
+    fn rows(&self) -> usize {
+        1
+    }
+
+    fn fill(&self, _column: usize, _first: usize, values: &mut [f64]) {
+        values.fill(0.0);
+    }
+}
+
+#[test]
+fn writer_refuses_what_could_not_be_read() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["out.parquet", "out.csv"] {
+        let path = folder.path().join(name);
+        let error = convert::write(&path, &Nameless, &mut |_| {}).unwrap_err();
+        assert_eq!(error.kind(), Kind::ColumnName, "{error}");
+    }
+    assert_eq!(
+        fs::read_dir(folder.path()).unwrap().count(),
+        0,
+        "nothing is left"
     );
 }
 
