@@ -8,6 +8,7 @@
 
 use std::{
     borrow::Cow,
+    collections::HashSet,
     fs,
     io::Write,
     path::{Path, PathBuf},
@@ -189,6 +190,7 @@ fn separator(header: &str) -> u8 {
 
 fn names(source: &str, line: u64, header: &str, separator: u8) -> Result<Vec<String>> {
     let mut names: Vec<String> = Vec::new();
+    let mut known = HashSet::new();
     for (column, field) in Fields::new(header, separator).enumerate() {
         let place = Place {
             line: Some(line),
@@ -216,7 +218,7 @@ fn names(source: &str, line: u64, header: &str, separator: u8) -> Result<Vec<Str
                 "a name for each column",
             );
         }
-        if names.iter().any(|known| known == name) {
+        if !known.insert(name.to_owned()) {
             return fault(
                 Kind::ColumnName,
                 format!("{} again", quoted(name)),
@@ -415,12 +417,13 @@ impl Writer {
             line: String::new(),
             rows: 0,
         };
+        let mut known = HashSet::new();
         for (column, name) in writer.names.iter().enumerate() {
             let readable = !name.is_empty()
                 && name.trim() == name
                 && !name.contains(['\n', '\r', '\u{feff}'])
                 && name.parse::<f64>().is_err()
-                && !writer.names[..column].contains(name);
+                && known.insert(name.as_str());
             if !readable {
                 return Err(Error::new(
                     Kind::ColumnName,

@@ -368,6 +368,18 @@ fn columns_get_the_names_that_are_asked_for() {
     );
 }
 
+/// Each name compared with all before it was five billion comparisons, for the reader and for the writer.
+#[test]
+fn a_hundred_thousand_columns_take_no_minute() {
+    let names: Vec<String> = (0..100_000).map(|column| format!("x{column}")).collect();
+    let row = "1,".repeat(names.len());
+    let text = format!("t_s,{}\n{row}1\n", names.join(","));
+    let read = csv::parse("wide.csv", text.as_bytes()).unwrap();
+    assert_eq!(read.names().len(), names.len() + 1);
+    let folder = tempfile::tempdir().unwrap();
+    Writer::create(&folder.path().join("wide.csv"), &names).unwrap();
+}
+
 #[test]
 fn writer_refuses_what_could_not_be_read() {
     let folder = tempfile::tempdir().unwrap();
