@@ -73,16 +73,22 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
     let mut columns = vec![Ok(Vec::with_capacity(expected_rows)); names.len()];
     let mut line_numbers = table::Lines::default();
     let mut decimal = Decimal::new(separator);
+    let only = format!("one, as in line {header_line}, which is taken for the header");
     for (row, (number, line)) in lines.enumerate() {
         let mut fields = Fields::new(line, separator);
         for (column, (name, values)) in names.iter().zip(&mut columns).enumerate() {
             let place = || Place::field(number, column, name);
             let field = fields.next().ok_or_else(|| {
+                let fields = if column == 1 { "field" } else { "fields" };
                 fault(
                     Kind::FieldCount,
                     Place::line(number),
-                    format!("{column} fields"),
-                    "one for each column of the header",
+                    format!("{column} {fields}"),
+                    if line.as_bytes().as_ptr_range().end == text.as_bytes().as_ptr_range().end {
+                        "one for each column of the header (the last line has no end: it may be cut)"
+                    } else {
+                        "one for each column of the header"
+                    },
                 )
             })?;
             let field = field.ok_or_else(|| unclosed(source, place()))?;
@@ -91,7 +97,10 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
             };
             match decimal.value(&field, number) {
                 Ok(number) => numbers.push(number),
-                Err((kind, expected)) => {
+                Err((kind, mut expected)) => {
+                    if let [_] = names.as_slice() {
+                        expected.push_str(" (commas, semicolons or tabs part fields)");
+                    }
                     *values = Err(fault(kind, place(), quoted(&field), &expected));
                 }
             }
@@ -102,8 +111,10 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
                 Kind::FieldCount,
                 Place::line(number),
                 format!("{} fields", names.len() + more),
-                // Every second column or more has a part too many.
-                if separator == b',' && 2 * more >= names.len() && !line.ends_with(',') {
+                // A line about the file ahead of its names; else every second column or more has a part too many.
+                if let [_] = names.as_slice() {
+                    &only
+                } else if separator == b',' && 2 * more >= names.len() && !line.ends_with(',') {
                     "one for each column of the header (numbers with a decimal comma need semicolons between them)"
                 } else {
                     "one for each column of the header"
@@ -132,6 +143,15 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
 
 /// The bytes as text, without a byte order mark.
 fn text<'a>(source: &str, bytes: &'a [u8]) -> Result<&'a str> {
+    if let [0xFF, 0xFE, ..] | [0xFE, 0xFF, ..] = bytes {
+        return Err(Error::new(
+            Kind::NotUtf8,
+            source,
+            Place::line(1),
+            "the byte order mark of UTF-16",
+            "UTF-8 text",
+        ));
+    }
     let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
     std::str::from_utf8(bytes).map_err(|error| {
         let good = &bytes[..error.valid_up_to()];

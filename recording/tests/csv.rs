@@ -80,7 +80,7 @@ fn a_separator_that_a_spreadsheet_states_is_no_header() {
 /// Each fault with the sentence it is told in.
 #[test]
 fn every_fault_has_its_place() {
-    let cases: [(&str, Kind, &str); 25] = [
+    let cases: [(&str, Kind, &str); 28] = [
         (
             "",
             Kind::Empty,
@@ -155,7 +155,23 @@ fn every_fault_has_its_place() {
         (
             "t_s,i_ref_a\r\n0,1\r\n1\r\n",
             Kind::FieldCount,
-            "r.csv, line 3: found 1 fields, expected one for each column of the header",
+            "r.csv, line 3: found 1 field, expected one for each column of the header",
+        ),
+        (
+            "t_s,i_ref_a,i_meas_a\n0,1,1\n1,2",
+            Kind::FieldCount,
+            "r.csv, line 3: found 2 fields, expected one for each column of the header (the last line has no end: it may be cut)",
+        ),
+        (
+            "# logger 3\n# 2024-03-31\nt_s,i_ref_a\n0,1\n",
+            Kind::FieldCount,
+            "r.csv, line 3: found 2 fields, expected one, as in line 1, which is taken for the header",
+        ),
+        (
+            "t_s|i_ref_a\n0|1\n",
+            Kind::NotANumber,
+            "r.csv, line 2, column 1 (t_s|i_ref_a): found \"0|1\", expected a number or an empty field (commas, semicolons or tabs part \
+             fields)",
         ),
         (
             "t_s,i_ref_a\n0,-inf\n",
@@ -312,6 +328,12 @@ fn bytes_that_are_not_utf8_are_placed() {
         error.to_string(),
         "r.csv, line 3: found the byte 0xff after 2 characters, expected UTF-8 text"
     );
+    for in_utf_16 in [b"\xff\xfet\0_\0s\0", b"\xfe\xff\0t\0_\0s"] {
+        assert_eq!(
+            csv::parse("r.csv", in_utf_16).unwrap_err().to_string(),
+            "r.csv, line 1: found the byte order mark of UTF-16, expected UTF-8 text"
+        );
+    }
 }
 
 #[test]
