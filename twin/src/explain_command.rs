@@ -186,8 +186,10 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
             .map(|path| path.display().to_string()),
         without: arguments.without.clone(),
         out: Some(out.display().to_string()),
+        calibration: false,
     };
     let calibration = calibration::calibrate(&model, &report);
+    report.inputs.calibration = calibration.text.is_some();
     report.remarks.extend(calibration.remarks);
     let elsewhere = acts_elsewhere(&report);
     report.remarks.extend(elsewhere);

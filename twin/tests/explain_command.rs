@@ -125,6 +125,10 @@ fn writes_report_page_model_and_calibration() {
     assert!((found("gain") - 1.02).abs() < 0.002, "{text}");
     assert!((found("offset") - 1.5).abs() < 0.1, "{text}");
     // The board is told what takes it out again: (1 + gain)·1.02·(i + 1.5) − drift = i.
+    assert!(
+        summary.contains("report.json, model.toml, calibration.toml"),
+        "{summary}"
+    );
     let calibration: toml::Table = read("calibration.toml").parse().unwrap();
     let registers = calibration["register"].as_array().unwrap();
     let value = |name: &str| {

@@ -90,6 +90,9 @@ pub struct Inputs {
     /// runs of the same input write the same file wherever they write it.
     #[serde(skip)]
     pub out: Option<String>,
+    /// Whether `calibration.toml` is written there too.
+    #[serde(skip)]
+    pub calibration: bool,
 }
 
 /// One signal, before and after.

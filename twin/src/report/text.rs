@@ -285,7 +285,11 @@ fn files(report: &Report, width: usize) -> Vec<String> {
         wrap(&mut lines, &words, 0, width, 2);
     }
     let seconds = significant(report.seconds, 2);
-    let names = "report.html, report.json, model.toml";
+    let names = if report.inputs.calibration {
+        "report.html, report.json, model.toml, calibration.toml"
+    } else {
+        "report.html, report.json, model.toml"
+    };
     let words = match &report.inputs.out {
         Some(out) => {
             let out = tail(out.trim_end_matches('/'), width / 2);

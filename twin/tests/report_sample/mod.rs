@@ -318,6 +318,7 @@ pub fn partly_explained_of(rows: usize) -> Report {
             reference: Some("drives/shunt.csv".to_owned()),
             without: Vec::new(),
             out: Some("out/city".to_owned()),
+            calibration: false,
         },
         plots: vec![plots],
     }
