@@ -188,6 +188,9 @@ pub fn run(arguments: &Arguments) -> Result<String, Failure> {
         out: Some(out.display().to_string()),
         calibration: false,
     };
+    if arguments.reference.is_some() {
+        report.remarks.extend(late_beside_a_clock(&report));
+    }
     let calibration = calibration::calibrate(&model, &report);
     report.inputs.calibration = calibration.text.is_some();
     report.remarks.extend(calibration.remarks);
@@ -385,6 +388,20 @@ fn write(folder: &Folder, files: &[(&str, String)]) -> Result<Option<PathBuf>, F
     Ok(None)
 }
 
+/// Two clocks are compared by the readings themselves: what makes these late all the same has gone into the clocks.
+fn late_beside_a_clock(report: &Report) -> Vec<String> {
+    let effects = report.effects.iter();
+    let late = effects.filter(|effect| matches!(effect.id.as_str(), "delay" | "clock-skew"));
+    late.map(|effect| {
+        format!(
+            "{} of {}: how late a sensor is and how its clock stands look the same; this is what is left beside what the clocks' comparison has \
+             taken out, and the interval knows nothing of that",
+            effect.id, effect.signal
+        )
+    })
+    .collect()
+}
+
 /// What the model file cannot say: it has one table for an effect in all that a sensor, or a battery, reports.
 fn acts_elsewhere(report: &Report) -> Vec<String> {
     let effects = report.effects.iter();
@@ -515,4 +532,33 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
         shift.current_holds = shift.current_holds.or(fitted.current_holds);
     }
     model.extended(&found, shift, file.parent().unwrap_or(Path::new("")), out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_delay_on_two_clocks_is_doubted() {
+        let effect = |id: &str| EffectReport {
+            id: id.to_owned(),
+            signal: "i_meas_a".to_owned(),
+            statement: String::new(),
+            equation: String::new(),
+            parameters: Vec::new(),
+            held_out_gain: 0.9,
+            placebo_p99: 0.1,
+            by_place: None,
+            equivalent_to: Vec::new(),
+            separated_by: String::new(),
+            consequences: Vec::new(),
+        };
+        let report = Report {
+            effects: vec![effect("gain"), effect("delay")],
+            ..Report::default()
+        };
+        let said = late_beside_a_clock(&report);
+        assert_eq!(said.len(), 1, "{said:?}");
+        assert!(said[0].starts_with("delay of i_meas_a: "), "{said:?}");
+    }
 }
