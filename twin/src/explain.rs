@@ -209,7 +209,12 @@ fn one(
         options,
         report,
     );
-    let said = left_out.map(|reach_s| lead_in::told(&problem.name, reach_s));
+    // What made them so may have been taken back since.
+    let is_named = report
+        .effects
+        .iter()
+        .any(|effect| effect.signal == problem.name);
+    let said = left_out.map(|reach_s| lead_in::told(&problem.name, reach_s, is_named));
     report.remarks.extend(said);
     part
 }

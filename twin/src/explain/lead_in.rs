@@ -74,8 +74,13 @@ pub(super) fn without(problem: &Problem, reach_s: [f64; 2]) -> Problem {
     }
 }
 
-/// What is said of it.
-pub(super) fn told(name: &str, [before_s, after_s]: [f64; 2]) -> String {
+/// What is said of it; whether anything is named in the end.
+pub(super) fn told(name: &str, [before_s, after_s]: [f64; 2], is_named: bool) -> String {
+    let by = if is_named {
+        "what is named"
+    } else {
+        "an effect that fitted best, and is not named"
+    };
     let side =
         |time_s: f64, what: &str| (time_s > 0.0).then(|| format!("the {what} {} s", short(time_s)));
     let sides: Vec<String> = [side(before_s, "first"), side(after_s, "last")]
@@ -84,7 +89,7 @@ pub(super) fn told(name: &str, [before_s, after_s]: [f64; 2]) -> String {
         .collect();
     format!(
         "{name}: {} of the recording, and of each stretch after a gap, are not looked at: readings there depend on what the reference \
-         did outside, by what is named",
+         did outside, by {by}",
         sides.join(" and ")
     )
 }
@@ -117,5 +122,15 @@ mod tests {
         // Five readings, in fifty rows, of four hundred.
         let reach = missed(&bench, &shown).unwrap();
         assert_eq!(reach, [late_s, 0.0]);
+    }
+
+    #[test]
+    fn what_is_not_named_is_not_said_to_be() {
+        let said = told("i_meas_a", [0.0, 0.5], true);
+        assert!(said.starts_with("i_meas_a: the last 0.500 s of"), "{said}");
+        assert!(said.ends_with("by what is named"), "{said}");
+        let said = told("i_meas_a", [0.5, 0.0], false);
+        assert!(said.starts_with("i_meas_a: the first 0.500 s of"), "{said}");
+        assert!(said.ends_with("and is not named"), "{said}");
     }
 }
