@@ -5,7 +5,8 @@
 //!    with what does not overlap left as it is.
 //! 2. Rate: the best offset of each of several blocks, and a line through them.
 //! 3. Fine: least squares over offset, rate and a smoothing of the reference (a first-order lag or a moving average,
-//!    whichever fits better), with gain and zero solved within. Without the smoothing a lag would be taken for a shift.
+//!    whichever fits better), with gain and zero solved within. Without the smoothing a lag would be taken for a shift; with one that the
+//!    readings do not tell a shift would be taken for a lag, so that none is taken unless the squares are lower by more than chance.
 //! 4. Wider: the coarse search once for each of many rates, as a clock that runs 1 % fast has no offset at which all of a
 //!    recording fits; where another rate than a crystal's is likelier, 1 to 3 again from there, and the better fit counts.
 //! 5. Chance: among thousands of offsets and a hundred rates one suits any two recordings somewhat. Where the values are little
@@ -367,6 +368,11 @@ fn search(driven: &Signal, sensed: &Signal, rate: f64) -> Option<Found> {
         }
     }
     fine.take(fit.descend(fine, 0.05 * step_s));
+    // A short lag looks like a shift by as much: what does without is as good, unless the squares are lower by more than chance.
+    let plain = fit.without_smoothing(fine, step_s);
+    if plain.cost <= fine.cost + seldom * fine.cost.abs() {
+        fine = plain;
+    }
     let smooth = fit.smooth(fine.shape, fine.smoothing_s);
     // Not (1 + rate)·(1 + own) − 1, which leaves fewer digits of a small one.
     let own = fine.drift_s / fit.span_s;
@@ -975,11 +981,37 @@ impl Fit<'_> {
         2.0 * FASTEST_RATE * self.span_s + step_s
     }
 
+    /// The best fit near `from` on the reference as it was recorded.
+    fn without_smoothing(&self, from: Trial, step_s: f64) -> Trial {
+        if from.smoothing_s == 0.0 {
+            return from;
+        }
+        let smooth = self.smooth(from.shape, 0.0);
+        let mut best = Trial::worst();
+        for index in -80_i32..=80 {
+            let offset_s = from.offset_s + f64::from(index) / 40.0 * step_s;
+            best.take(Trial {
+                smoothing_s: 0.0,
+                offset_s,
+                cost: self.cost(&smooth, offset_s, from.drift_s),
+                ..from
+            });
+        }
+        let found = self.descend_from(best, 0.05 * step_s, |_| 0.0);
+        best.take(found);
+        best
+    }
+
     /// Nelder and Mead's simplex over offset, drift and smoothing.
     fn descend(&self, start: Trial, step_s: f64) -> Trial {
+        self.descend_from(start, step_s, f64::abs)
+    }
+
+    /// The same with a smoothing that follows from the third coordinate.
+    fn descend_from(&self, start: Trial, step_s: f64, smoothing: impl Fn(f64) -> f64) -> Trial {
         let farthest_s = self.farthest_s(step_s);
         let at = |point: [f64; 3]| {
-            let smoothing_s = point[2].abs();
+            let smoothing_s = smoothing(point[2]);
             if smoothing_s > 0.3 * self.span_s || point[1].abs() > farthest_s {
                 return f64::INFINITY;
             }
@@ -1003,7 +1035,7 @@ impl Fit<'_> {
         }
         Trial {
             shape: start.shape,
-            smoothing_s: best.0[2].abs(),
+            smoothing_s: smoothing(best.0[2]),
             offset_s: best.0[0] - 0.5 * best.0[1],
             drift_s: best.0[1],
             cost: best.1,

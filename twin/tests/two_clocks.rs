@@ -218,6 +218,30 @@ fn the_right_peak_is_found_and_chance_is_not() {
     );
 }
 
+/// A lag of a tenth of a row looks like a shift by as much. Taken for the sensor's it would be left out of the clocks, and be named as a
+/// delay that the sensor does not have.
+#[test]
+fn a_clock_is_not_late_by_a_lag_that_nothing_tells() {
+    let file =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../recordings/panasonic-18650pf/25c-us06.csv");
+    let recording = recording::csv::read(&file).unwrap();
+    let current = recording.need("i_ref_a").unwrap()[3000..].to_vec();
+    let course: Course = Box::new(move |t| {
+        let row = (t / STEP_S) as usize;
+        let share = t / STEP_S - row as f64;
+        19.0 * (current[row] + (current[row + 1] - current[row]) * share)
+    });
+    let t_s: Vec<f64> = (0..6000).map(|row| f64::from(row) / 20.0).collect();
+    let value: Vec<f64> = t_s.iter().map(|t| course(*t)).collect();
+    let reference = Signal::new(&t_s, &value, |_| true);
+    for (seed, offset_s, fast) in [(1, 5.02, 30e-6), (2, 7.777, 0.0), (3, 12.34, -80e-6)] {
+        let sensed = sensor(&course, fast, offset_s, 0.05, seed);
+        let found = estimate(&reference, &sensed).unwrap();
+        let late_s = found.on_reference(0.5 * SPAN_S) - (0.5 * SPAN_S / (1.0 + fast) + offset_s);
+        assert!(late_s.abs() < 0.01 * STEP_S, "{seed}: off by {late_s} s");
+    }
+}
+
 /// Any rate would suit two edges of which one is late: that is the sensor's delay, for all that is known.
 #[test]
 fn two_edges_make_no_rate() {
