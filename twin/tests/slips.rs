@@ -94,6 +94,19 @@ fn a_few_slips_speak_against_no_name_and_are_told() {
     }
 }
 
+/// A sensor that was not up yet as the log began, a last line that was cut.
+#[test]
+fn the_first_and_the_last_reading_slip_as_others_do() {
+    for slip in [(0, -250.0), (1499, 180.0)] {
+        let report = said(1500, &[slip], true, 3);
+        let what = format!("{slip:?}: {}", report["summary"]);
+        assert_eq!(names(&report), ["gain", "offset"], "{what}");
+        assert_ne!(report["verdict"], "unknown", "{what}");
+        let told = report["remarks"].to_string();
+        assert!(told.contains("one reading is off"), "{what}: {told}");
+    }
+}
+
 #[test]
 fn voltages_that_were_not_read_hide_no_branch() {
     let cell = Cell {

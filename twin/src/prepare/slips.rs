@@ -3,7 +3,8 @@
 //! A dropped byte, a refused frame, a converter that was read in the middle of a write. Left in, one of fifty amperes in a noise of a tenth
 //! weighs as much as hundreds of readings together, by Huber's loss too, and names that have nothing to do with it are not told from
 //! placebos. It is known by standing alone: the readings before and after agree, it is far from both, and the current does not move
-//! as much around it, so that no time, memory or filter of a sensor could have made it of the current.
+//! as much around it, so that no time, memory or filter of a sensor could have made it of the current. The first and the last reading of a
+//! stretch (a sensor that was not up yet, a line that was cut) have both others to one side.
 
 use recording::error::number;
 
@@ -26,7 +27,7 @@ const BEYOND_SIGNAL: f64 = 2.0;
 const BEYOND_JUMPS: f64 = 3.0;
 /// Jumps that are not looked at for that, in times of the share of slips: each makes two.
 const THEIRS: f64 = 3.0;
-/// The readings before and after differ by less than this share of it.
+/// The two readings beside it differ by less than this share of it.
 const AGREE: f64 = 0.5;
 /// Steps to either side of an instant at which an effect acts, within which a reading may be that effect's.
 const NEXT_TO: f64 = 1.5;
@@ -44,7 +45,7 @@ pub(super) fn leave_out(problem: &mut Problem) -> Option<String> {
         problem.observed.valid[*row] = false;
     }
     Some(format!(
-        "{}: {count} {are} off by more than {STRAY} times the noise from those before and after, which agree, the worst by {} {} at {} s: \
+        "{}: {count} {are} off by more than {STRAY} times the noise from the two beside, which agree, the worst by {} {} at {} s: \
          slips of the log, left out",
         problem.name,
         at_most(worst, 3),
@@ -90,10 +91,17 @@ fn slips(problem: &Problem) -> Vec<(usize, f64)> {
     let far = (STRAY * noise).max(BEYOND_JUMPS * usual);
     let instants_s = instants_s(problem);
     let next_to_s = NEXT_TO * problem.drive.median_step_s();
-    let found: Vec<(usize, f64)> = (1..rows.len().saturating_sub(1))
+    let found: Vec<(usize, f64)> = (0..rows.len())
         .filter_map(|at| {
-            let [before, row, after] = [rows[at - 1], rows[at], rows[at + 1]];
-            let [from, to] = [off(row) - off(before), off(row) - off(after)];
+            let row = rows[at];
+            // Its neighbours; at an end of a stretch both are to one side.
+            let trio = [at.checked_sub(1), Some(at), at.checked_sub(2)]
+                .into_iter()
+                .flatten()
+                .find_map(|from| rows.get(from..from + 3).filter(|trio| together(trio)))?;
+            let mut beside = trio.iter().filter(|other| **other != row);
+            let (one, other) = (*beside.next()?, *beside.next()?);
+            let [from, to] = [off(row) - off(one), off(row) - off(other)];
             let alone = from.abs().min(to.abs());
             let around = at.saturating_sub(AROUND)..rows.len().min(at + AROUND + 1);
             let moves = || {
@@ -104,8 +112,7 @@ fn slips(problem: &Problem) -> Vec<(usize, f64)> {
             };
             let is_slip = from * to > 0.0
                 && alone > far
-                && (off(before) - off(after)).abs() < AGREE * alone
-                && together(&[before, row, after])
+                && (off(one) - off(other)).abs() < AGREE * alone
                 && alone > BEYOND_SIGNAL * moves()
                 && !is_near(&instants_s, observed.t_s[row], next_to_s);
             is_slip.then_some((row, alone))
@@ -179,6 +186,11 @@ mod tests {
                 };
                 assert_eq!(found(&slipped), expected, "{by_a} A in row {row}");
             }
+        }
+        // The first and the last one, too.
+        for row in [0, 1, 3998, 3999] {
+            let slipped = problem(4000, |at, i| i[at] + if at == row { -200.0 } else { 0.0 });
+            assert_eq!(found(&slipped), [row]);
         }
         // Without a stated noise it is what the others differ by.
         let mut slipped = problem(4000, |at, i| i[at] + if at == 33 { 20.0 } else { 0.0 });
