@@ -19,9 +19,10 @@ pub const TURNS_LIMITS: (i32, i32) = (1, 20_000);
 pub const FULL_SCALE_LIMITS: (Microamps, Microamps) =
     (Microamps::from_amps(1), Microamps::from_amps(2_000));
 
-/// Smallest sensitivity of the signal that [`FrontEnd::validate`] accepts: 1 mV/A, that is 1,000 µA per µV. Below it a
-/// converter step is above 2 A, and the folded coefficients of the converter would not fit.
-pub const MAX_MICROAMPS_PER_MICROVOLT: i64 = 1_000;
+/// Smallest sensitivity of the signal that [`FrontEnd::validate`] accepts: 1.053 mV/A, that is 950 µA per µV. Below it
+/// [`FrontEnd::meter_full_scale`] would be above the 2,147 A that a current can be, and stay there; a converter step is above 2 A,
+/// and the folded coefficients of the converter would not fit.
+pub const MAX_MICROAMPS_PER_MICROVOLT: i64 = 950;
 
 /// One value for each of the two sensors. A board with one sensor uses both alike, or the first.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -672,6 +673,37 @@ pub(crate) mod tests {
         ]
     }
 
+    /// Stopped at the type's end it would be too small, and with it all of the charge.
+    #[test]
+    fn the_meters_full_scale_of_an_accepted_sensor_is_exact() {
+        for signal_millivolts in 1_500..2_400 {
+            let swing = millivolts(signal_millivolts);
+            let sensors = [
+                FrontEnd::DualRange(DualRange {
+                    full_scale: PerRange {
+                        small: Microamps::from_amps(200),
+                        large: FULL_SCALE_LIMITS.1,
+                    },
+                    swing,
+                    ..DualRange::default()
+                }),
+                FrontEnd::Hah1bv(Hah1bv {
+                    microvolts_per_amp: signal_millivolts / 2,
+                    full_scale: FULL_SCALE_LIMITS.1,
+                }),
+            ];
+            for sensor in sensors {
+                let line = sensor.line(Range::Large, FIVE);
+                let exact = mul_div(2_250_000_000, line.numerator, line.denominator);
+                let full_scale = i64::from(sensor.meter_full_scale(Range::Large).get());
+                assert!(
+                    sensor.validate().is_err() || full_scale == exact,
+                    "{sensor:?}: {full_scale} of {exact}"
+                );
+            }
+        }
+    }
+
     #[test]
     fn d0_reproduces_its_numbers() {
         let d0 = FrontEnd::default();
@@ -920,9 +952,9 @@ pub(crate) mod tests {
             Err(FrontEndError::Sensitivity)
         );
         assert_eq!(d0(60_000_000, 600_000_000, 2_499_999), Ok(()));
-        assert_eq!(d0(60_000_000, 600_000_000, 600_000), Ok(()));
+        assert_eq!(d0(60_000_000, 600_000_000, 631_579), Ok(()));
         assert_eq!(
-            d0(60_000_000, 601_000_000, 600_000),
+            d0(60_000_000, 601_000_000, 631_579),
             Err(FrontEndError::Sensitivity)
         );
         let high_zero = |zero| {
@@ -943,8 +975,8 @@ pub(crate) mod tests {
             .validate()
         };
         assert_eq!(hah1bv(0), Err(FrontEndError::Sensitivity));
-        assert_eq!(hah1bv(1_000), Ok(()));
-        assert_eq!(hah1bv(999), Err(FrontEndError::Sensitivity));
+        assert_eq!(hah1bv(1_053), Ok(()));
+        assert_eq!(hah1bv(1_052), Err(FrontEndError::Sensitivity));
         let network = |sensor_nanovolts_per_amp| {
             FrontEnd::Network(Network {
                 sensor_nanovolts_per_amp,
@@ -1006,18 +1038,18 @@ pub(crate) mod tests {
             with(2_000, relations(0, 13_000_000_000, 0, 2_500_000_000)),
             Ok(())
         );
-        // 1 mV/A with N = 2,000 is 2 Ω: below it at one end of the supply alone.
+        // 1.053 mV/A with N = 2,000 is 2.105 Ω: below it at one end of the supply alone.
         let coarse = Err(FrontEndError::Sensitivity);
         assert_eq!(
-            with(2_000, relations(1_000_000_000, -2_501_000_000, half, 0)),
+            with(2_000, relations(1_000_000_000, -2_396_000_000, half, 0)),
             coarse
         );
         assert_eq!(
-            with(2_000, relations(-1_000_000_000, 7_499_000_000, half, 0)),
+            with(2_000, relations(-1_000_000_000, 7_604_000_000, half, 0)),
             coarse
         );
         assert_eq!(
-            with(2_000, relations(-1_000_000_000, 7_500_000_000, half, 0)),
+            with(2_000, relations(-1_000_000_000, 7_605_000_000, half, 0)),
             Ok(())
         );
         assert_eq!(
