@@ -118,7 +118,7 @@ impl Command {
         (
             Self::FinishSupplyCalibration,
             "finish supply calibration",
-            "work out k1, m1, k2, m2 and use them",
+            "work out k1, m1, k2, m2 and use them, without the zero drift and key factors of before",
         ),
         (
             Self::Abort,

@@ -523,6 +523,60 @@ fn a_supply_sweep_by_orders_gives_the_relations() {
     );
 }
 
+/// The relations hold all of the sensor's zero: what a zero drift and key factors took off before is in them.
+#[test]
+fn a_swept_sensor_reads_0_a_whatever_its_zero_was_corrected_by_before() {
+    let truth = FrontEnd::ClosedLoop(closed_loop());
+    let mut configuration = with_front_end(FrontEnd::ClosedLoop(ClosedLoop::default()));
+    configuration.supply_test_current = Microamps::from_amps(200);
+    configuration.converter.data_rate = core_logic::converter::DataRate::Sps8;
+    configuration.key_calibration.enabled = false;
+    configuration
+        .zero_drift
+        .value
+        .set(Range::Small, Microamps::from_amps(-2));
+    configuration.key_factors = KeyFactors {
+        k_ppb: 1_004_016_064,
+        a: Microvolts(10_000),
+    };
+    let mut bench = Bench::new(configuration);
+    for (amps, order) in [
+        (0, Order::SupplyPointAtZero),
+        (200, Order::SupplyPointAtCurrent),
+    ] {
+        for millivolts in [4_550, 4_700, 4_850, 5_000, 5_150, 5_300, 5_450] {
+            let supply = Microvolts::from_millivolts(millivolts);
+            bench.environment.supply = Some(supply);
+            let output = truth.voltage(Microamps::from_amps(amps), Range::Small, supply);
+            bench.code = (f64::from(output.get()) / f64::from(supply.get()) * 32_768.0) as i16;
+            bench.run_ms(1_500);
+            assert_eq!(bench.order(order), Ok(()), "{millivolts} mV");
+        }
+    }
+    assert_eq!(bench.order(Order::FinishSupplyCalibration), Ok(()));
+    let supply = design::SENSOR_NOMINAL_SUPPLY;
+    bench.environment.supply = Some(supply);
+    let output = truth.voltage(Microamps::ZERO, Range::Small, supply);
+    bench.code = (f64::from(output.get()) / f64::from(supply.get()) * 32_768.0) as i16;
+    // The bench's meter has not seen the test current: the disagreement has to clear.
+    bench.run_ms(15_000);
+    let current = bench.measurement.current();
+    // A code is 23 mA.
+    assert!(
+        current.current.saturating_abs() < Microamps::from_milliamps(50),
+        "{current:?}"
+    );
+    assert_eq!(current.validity, Validity::VALID);
+    // The meter hangs on the same sensor.
+    let meter = bench.measurement.meter_config(&bench.configuration);
+    let expected = effective_meter_config(
+        &with_front_end(bench.configuration.front_end),
+        KeyFactors::NONE,
+        Some(supply),
+    );
+    assert_eq!(meter.offset.small, expected.offset.small);
+}
+
 #[test]
 fn orders_are_refused_with_their_reason_where_they_make_no_sense() {
     let mut bench = Bench::new(Configuration::default());

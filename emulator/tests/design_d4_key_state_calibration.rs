@@ -332,6 +332,10 @@ fn supply_sweep_over_rs485_finds_the_relations() {
     );
     const TEST_A: f64 = 200.0;
     bench.set("supply calibration: test current", &[200_000_000]);
+    // What the zero was corrected by before the sweep: the relations hold all of it.
+    bench.set("zero drift", &[-2_000_000, 0]);
+    bench.set("key factor k", &[1_004_000_000]);
+    bench.set("key factor a", &[10_000]);
     let at = |supply_v: f64, amps: f64| Row {
         sensor_supply_v: supply_v,
         converter_supply_v: supply_v,
