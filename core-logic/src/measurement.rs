@@ -35,8 +35,8 @@ use crate::modbus::readings::CommandState;
 use crate::modbus::{Activity, Readings};
 use crate::open_sensor::{Finding, OpenSensor, OpenSensorThresholds};
 use crate::range::{
-    ChatterDetector, ChatterReport, FlagObservation, FlagPlausibility, FlagReport, Range,
-    RangeHistory,
+    ChatterDetector, ChatterReport, FlagObservation, FlagPlausibility, FlagReport, Miscounted,
+    Range, RangeHistory,
 };
 use crate::retained::{LogRecord, RetainedState};
 use crate::sliding_average::{Average, SlidingAverage};
@@ -296,7 +296,8 @@ pub struct Measurement {
     chatter: ChatterReport,
     meter: MeterReport,
     gap: Gap,
-    /// What faults have miscounted that were found: a meter that stood still or disagreed, a flag against the level.
+    /// What faults have miscounted that were found: a meter that stood still or disagreed, a flag against the level, a sensor
+    /// that showed nothing.
     miscounted: Nanocoulombs,
     /// As much of the charge's doubt as the state of charge has in its own.
     doubted: Nanocoulombs,
@@ -339,6 +340,8 @@ pub struct Measurement {
     started: Instant,
     now: Instant,
     // The largest parts come last, hence `repr(C)`: the nearer a member is, the shorter is the instruction that reaches it.
+    /// Of [`Measurement::miscounted`] what the sensor has not shown.
+    unseen: Miscounted,
     compare: ChannelCompare,
     sweep: Option<SupplyCalibration>,
     average: SlidingAverage,
@@ -525,6 +528,7 @@ impl Measurement {
             meter: MeterReport::default(),
             gap: Gap::new(now),
             miscounted: Nanocoulombs::ZERO,
+            unseen: Miscounted::NONE,
             doubted: Nanocoulombs::ZERO,
             meter_causes: Validity::STALE,
             basis_number: 1,
@@ -776,7 +780,8 @@ impl Measurement {
             self.converter
                 .forget_meter_until(report.at.unwrap_or(self.now));
         }
-        self.miscounted = compared.miscounted.saturating_add(self.flag.miscounted);
+        let by_sensor = self.flag.miscounted.saturating_add(self.unseen.charge);
+        self.miscounted = compared.miscounted.saturating_add(by_sensor);
         let declared = report.uncertainty.saturating_add(self.miscounted);
         let doubt = declared.saturating_sub(self.doubted);
         if doubt > Nanocoulombs::ZERO {
@@ -1100,6 +1105,16 @@ impl Measurement {
             &reading,
         );
         self.average.push(&configuration.average, &reading);
+        // At the sensor's end, at a rail or without a supply neither channel sees what flows: anything within full scale.
+        let validity = self.current_validity(reading.validity);
+        let blind = Validity::SATURATED.and(Validity::SUPPLY);
+        let off = if validity.bits() & blind.bits() != 0 {
+            let shown = reading.current.saturating_abs();
+            configuration.meter.full_scale.large.saturating_add(shown)
+        } else {
+            Microamps::ZERO
+        };
+        self.unseen.note(reading.at, off);
         self.gap.on_conversion(
             &configuration.meter,
             &gap::Conversion {
@@ -1108,7 +1123,7 @@ impl Measurement {
                 current: reading.current,
                 range: reading.range,
                 edges: history.edges,
-                is_valid: self.current_validity(reading.validity).is_valid(),
+                is_valid: validity.is_valid(),
             },
         );
         self.compare.on_conversion(

@@ -430,6 +430,33 @@ pub struct FlagReport {
     pub miscounted: Nanocoulombs,
 }
 
+/// Bound of a charge that is counted while the current is known to be off.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct Miscounted {
+    /// So far.
+    pub charge: Nanocoulombs,
+    /// The newest look: when, and by how much the current was off.
+    last: Option<(Instant, Microamps)>,
+}
+
+impl Miscounted {
+    /// Nothing, and no look yet.
+    pub const NONE: Self = Self {
+        charge: Nanocoulombs::ZERO,
+        last: None,
+    };
+
+    /// The current is off by `off` at `at`; since the look before, by as much or by what it was then.
+    #[inline(never)]
+    pub fn note(&mut self, at: Instant, off: Microamps) {
+        if let Some((since, before)) = self.last.replace((at, off)) {
+            let charge = charge_of(off.max(before), elapsed(since, at));
+            self.charge = self.charge.saturating_add(charge);
+        }
+    }
+}
+
 /// Flag against measured level.
 ///
 /// What the level alone decides:
@@ -448,10 +475,8 @@ pub struct FlagReport {
 pub struct FlagPlausibility {
     /// Since when the raw finding differs from the reported one.
     differs_since: Option<Instant>,
-    /// The newest look: when, and by how much the current was off on the flag's scale.
-    last: Option<(Instant, Microamps)>,
-    /// Miscounted since the last agreement by a contradiction that is neither reported yet nor over.
-    pending: Nanocoulombs,
+    /// Miscounted on the flag's scale since the last agreement by a contradiction that is neither reported yet nor over.
+    pending: Miscounted,
     report: FlagReport,
 }
 
@@ -461,8 +486,7 @@ impl FlagPlausibility {
     pub const fn new() -> Self {
         Self {
             differs_since: None,
-            last: None,
-            pending: Nanocoulombs::ZERO,
+            pending: Miscounted::NONE,
             report: FlagReport {
                 implausible: false,
                 expected: None,
@@ -491,11 +515,7 @@ impl FlagPlausibility {
         } else {
             Microamps::ZERO
         };
-        if let Some((at, before)) = self.last {
-            let doubt = charge_of(off.max(before), elapsed(at, observation.at));
-            self.pending = self.pending.saturating_add(doubt);
-        }
-        self.last = Some((observation.at, off));
+        self.pending.note(observation.at, off);
         let was_implausible = self.report.implausible;
         if contradiction == self.report.implausible {
             self.differs_since = None;
@@ -510,7 +530,7 @@ impl FlagPlausibility {
             }
         }
         if was_implausible || self.report.implausible || !contradiction {
-            let pending = core::mem::take(&mut self.pending);
+            let pending = core::mem::take(&mut self.pending.charge);
             self.report.miscounted = self.report.miscounted.saturating_add(pending);
         }
         self.report

@@ -1714,6 +1714,41 @@ fn what_a_calibration_finds_goes_where_it_belongs() {
     assert_eq!(configuration.front_end, FrontEnd::ClosedLoop(closed_loop()));
 }
 
+/// A sensor beyond its range, and one at a rail: both channels see the same, and neither what flows.
+#[test]
+fn what_a_sensor_does_not_show_is_declared() {
+    for code in [8_000, 0] {
+        let mut bench = Bench::new(with_front_end(FrontEnd::Hah1bv(Hah1bv::default())));
+        bench.measurement.set_state_of_charge(Ppm(500_000), Ppm(0));
+        bench.run_ms(1_000);
+        let before = bench.readings();
+        assert!(before.charge_uncertainty < Nanocoulombs::from_coulombs(1));
+        let since = bench.now;
+        bench.code = code;
+        bench.report.mean_current = Microamps::from_amps(if code == 0 { -562 } else { 500 });
+        bench.count_ms(2_000);
+        bench.code = 4_096;
+        bench.report.mean_current = Microamps::ZERO;
+        bench.count_ms(1_500);
+        let readings = bench.readings();
+        assert_eq!(readings.charge_validity, Validity::VALID);
+        assert!(bench.measurement.charge().estimated);
+        // Whatever within full scale has flowed; not for longer than it stood so, a conversion before and after, and the 100 ms
+        // after which SensorSaturated clears.
+        let time_us = (bench.now - since - 1_400_000) as i64 + 2 * PERIOD_US as i64;
+        let counted = readings.charge.get().abs() / 1_000_000_000;
+        let declared = readings.charge_uncertainty.get() / 1_000_000_000;
+        assert!(declared >= counted + 1_000, "{declared} C");
+        assert!(declared < 1_200 * time_us / 1_000_000, "{declared} C");
+        // 240 Ah.
+        let uncertainty = i64::from(readings.soc_uncertainty.get()) * 864 / 1_000;
+        assert!(
+            uncertainty >= declared - 1,
+            "{uncertainty} C of {declared} C"
+        );
+    }
+}
+
 /// Line and CAN may follow the key at different times, but not a second apart.
 #[test]
 fn a_key_line_that_contradicts_can_is_reported() {

@@ -43,6 +43,8 @@ fn fault_f14_an_open_sensor_at_a_rail_is_found() {
     ] {
         let mut rig = steady(current_a);
         rig.run_s(0.6).unwrap();
+        let before = charges_c(&mut rig);
+        let bound_before_c = charge_bound_c(&rig);
         strike(&mut rig, &format!("F14:{fault},2s"));
         let mut wrong_ms = 0;
         let invalid_s = until(&mut rig, "an invalid current", 0.3, |rig| {
@@ -61,6 +63,15 @@ fn fault_f14_an_open_sensor_at_a_rail_is_found() {
         // Two conversions of 31 ms, the one under way and the frame.
         assert!(invalid_s <= 0.105, "{invalid_s}");
         assert!(named_s <= 0.3, "{named_s}");
+        // What the rail has counted stays in the charge, and is declared.
+        rig.run_s(4.0).unwrap();
+        assert_eq!(rig.view.charge_c().validity, 0);
+        let error_c = charge_error_c(&mut rig, before);
+        let declared_c = charge_bound_c(&rig) - bound_before_c;
+        println!("F14 {fault} at {current_a} A: {error_c:.1} C off, declared {declared_c:.1} C");
+        assert!(error_c.abs() > 1_000.0, "{error_c}");
+        assert!(error_c.abs() <= declared_c, "{error_c} {declared_c}");
+        assert!(declared_c < 2.0 * error_c.abs(), "{error_c} {declared_c}");
     }
 }
 
