@@ -114,6 +114,7 @@ macro_rules! diagnoses {
 }
 
 diagnoses! {
+    // 15 clears when the factory's window of the meter's mean, a second, has nothing of it any more.
     // number, name: condition, threshold; set, clear, severity, latch, effect on [current] [charge] [soc]
     0 OpenSensor: "The sensor in use is not connected.",
         "network output below the open threshold: 0.15 V open, lowest legal output from the front end (D3; `OpenSensorConfig`)";
@@ -162,7 +163,7 @@ diagnoses! {
         0 ms, 10000 ms, Error, WhileActive, [IMPLAUSIBLE] [IMPLAUSIBLE] [IMPLAUSIBLE]
     15 FlagImplausible: "Range flag and signal level contradict each other.",
         "switching current ±53.33 A with margin, 200 ms at most (`SWITCHING_CURRENT`)";
-        0 ms, 1000 ms, Error, WhileActive, [IMPLAUSIBLE] [IMPLAUSIBLE] [IMPLAUSIBLE]
+        0 ms, 2000 ms, Error, WhileActive, [IMPLAUSIBLE] [IMPLAUSIBLE] [IMPLAUSIBLE]
     16 RangeChatter: "The range changes more often than a drive profile explains; charge is estimated.",
         "edges per window (`ChatterConfig`)";
         0 ms, 1000 ms, Warning, WhileActive, [] [] []

@@ -896,6 +896,10 @@ impl Measurement {
         let conditions = self.conditions(configuration).union(external);
         let changes = self.diagnosis.step(now, conditions);
         self.effects = self.diagnosis.effects();
+        if changes.cleared.contains(Code::FlagImplausible) {
+            // At a slow rate its conversions reach back beyond what was read by the wrong scale.
+            self.average.clear();
+        }
         Tick {
             hv_permit: self.key_outputs.hv_permit,
             changes,

@@ -100,6 +100,7 @@ impl SlidingAverage {
     }
 
     /// Empties the window.
+    #[inline(never)]
     pub const fn clear(&mut self) {
         self.next = 0;
         self.count = 0;

@@ -1577,7 +1577,7 @@ fn another_front_end_begins_without_the_faults_of_the_one_before() {
         bench.environment.network = Some(network_output(Microvolts::ZERO));
         bench.range = Range::Small;
         bench.next_conversion = u64::MAX;
-        bench.run_ms(1_500);
+        bench.run_ms(2_500);
         let active = bench.measurement.diagnosis().active();
         assert!(
             bench.measurement.current().validity.is_valid(),
@@ -1712,6 +1712,36 @@ fn what_a_calibration_finds_goes_where_it_belongs() {
     configuration.front_end = FrontEnd::ClosedLoop(ClosedLoop::default());
     Found::SupplyRelations(relations).store(&mut configuration);
     assert_eq!(configuration.front_end, FrontEnd::ClosedLoop(closed_loop()));
+}
+
+/// The level of 30 A on the small sensor, read by the large one's scale.
+#[test]
+fn means_are_no_longer_than_what_is_known_to_be_right() {
+    let mut configuration = Configuration::default();
+    configuration.average.length = 64;
+    let mut bench = Bench::new(configuration);
+    let hall = Microvolts::from_millivolts(3_625);
+    bench.code = 5_939;
+    bench.environment.network = Some(network_output(hall));
+    bench.report.mean_current = Microamps::from_amps(30);
+    bench.count_ms(3_000);
+    bench.range = Range::Large;
+    bench.report.mean_current = Microamps::from_amps(300);
+    bench.count_ms(1_000);
+    assert!(bench.has(Code::FlagImplausible));
+    bench.range = Range::Small;
+    bench.report.mean_current = Microamps::from_amps(30);
+    for _ in 0..500 {
+        bench.count_ms(10);
+        let average = bench.measurement.current_average(&bench.configuration);
+        let off = average.average.saturating_sub(Microamps::from_amps(30));
+        assert!(
+            !average.validity.is_valid() || off.saturating_abs() < Microamps::from_amps(1),
+            "{average:?}"
+        );
+    }
+    let average = bench.measurement.current_average(&bench.configuration);
+    assert_eq!((average.validity, average.samples), (Validity::VALID, 64));
 }
 
 /// A sensor beyond its range, and one at a rail: both channels see the same, and neither what flows.
