@@ -387,11 +387,11 @@ fn decode<T: DeserializeOwned>(kind: u8, bytes: &[u8]) -> Result<T, RetainedErro
 
 /// The value, and what lies between it and the CRC.
 fn read<T: DeserializeOwned>(kind: u8, bytes: &[u8]) -> Result<(T, &[u8]), RetainedError> {
-    let (body, checksum) = bytes
-        .split_last_chunk::<CHECKSUM_BYTES>()
-        .ok_or(RetainedError::TooShort)?;
+    let [body @ .., c0, c1, c2, c3] = bytes else {
+        return Err(RetainedError::TooShort);
+    };
     let (first, content) = body.split_first().ok_or(RetainedError::TooShort)?;
-    if CHECKSUM.checksum(body) != u32::from_le_bytes(*checksum) {
+    if CHECKSUM.checksum(body) != u32::from_le_bytes([*c0, *c1, *c2, *c3]) {
         return Err(RetainedError::Checksum);
     }
     if *first != kind {

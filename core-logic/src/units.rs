@@ -195,9 +195,6 @@ pub const fn div_round_i128(numerator: i128, denominator: i128) -> i128 {
 #[must_use]
 #[inline(never)]
 pub const fn div_i128(numerator: i128, denominator: i128) -> i128 {
-    if denominator == 0 {
-        return 0;
-    }
     let quotient = div_u128(numerator.unsigned_abs(), denominator.unsigned_abs());
     if (numerator < 0) == (denominator < 0) {
         if quotient > i128::MAX.unsigned_abs() {
@@ -210,7 +207,8 @@ pub const fn div_i128(numerator: i128, denominator: i128) -> i128 {
     }
 }
 
-/// `n / d`, `d` ≠ 0: a long division by digits of 32 bits (Knuth, The Art of Computer Programming 4.3.1, algorithm D).
+/// `n / d`, or 0 when `d` is 0: a long division by digits of 32 bits (Knuth, The Art of Computer Programming 4.3.1,
+/// algorithm D). No division in it can panic: each panic is a place in the flash, whether it is ever reached or not.
 ///
 /// The compiler's own goes bit by bit on this core, 5,500 clocks, too long for what must not delay a range edge.
 #[inline(never)]
@@ -218,7 +216,9 @@ const fn div_u128(n: u128, d: u128) -> u128 {
     let (n_high, n_low) = halves(n);
     let (d_high, d_low) = halves(d);
     if d_high == 0 {
-        let high = n_high / d_low;
+        let Some(high) = n_high.checked_div(d_low) else {
+            return 0;
+        };
         let low = div_2_by_1(n_high % d_low, n_low, d_low);
         return (high as u128) << 64 | low as u128;
     }
@@ -240,7 +240,10 @@ const fn halves(value: u128) -> (u64, u64) {
 #[inline(never)]
 const fn div_2_by_1(high: u64, low: u64, d: u64) -> u64 {
     if high == 0 {
-        return low / d;
+        return match low.checked_div(d) {
+            Some(quotient) => quotient,
+            None => 0,
+        };
     }
     const DIGIT: u64 = 1 << 32;
     // With the divisor's top bit set a guessed digit is at most two too large.
@@ -255,7 +258,9 @@ const fn div_2_by_1(high: u64, low: u64, d: u64) -> u64 {
     while place > 0 {
         place -= 1;
         let next = lower >> (32 * place) & (DIGIT - 1);
-        let mut digit = rest / d1;
+        let Some(mut digit) = rest.checked_div(d1) else {
+            return 0;
+        };
         let mut left = rest % d1;
         while digit >= DIGIT || digit * d0 > (left << 32 | next) {
             digit -= 1;
