@@ -658,7 +658,15 @@ impl Soc {
             return None;
         }
         let event = self.anchor(coefficients, table, cell.voltage);
-        self.anchored_at = Some(self.kept.uncertainty.get());
+        if let SocEvent::Anchored { .. } = event {
+            self.anchored_at = Some(self.kept.uncertainty.get());
+        } else {
+            // Told once: looked at again when it has moved, and been still since.
+            self.settled = Some(CellVoltage {
+                at: Instant::from_ticks(u64::MAX),
+                ..settled
+            });
+        }
         Some(event)
     }
 
@@ -1352,6 +1360,24 @@ mod tests {
         );
         assert_eq!(bench.soc.retained(), before);
         assert_eq!(bench.reading().anchors, 0);
+    }
+
+    /// As of a battery monitor that has been set right, or that answers at last, with the vehicle parked and nothing known.
+    #[test]
+    fn a_cells_voltage_after_one_of_none_anchors_in_the_same_rest() {
+        let mut bench = Bench::new(&config(), 500_000, 1_000_000);
+        bench.current = Some(Microamps::ZERO);
+        bench.cell = Some(Microvolts::ZERO);
+        bench.step(0, 0);
+        bench.rest(700);
+        assert_eq!(bench.reading().anchors, 0);
+        bench.cell = Some(Microvolts(3_600_000));
+        bench.rest(config().stability_window_s);
+        assert_eq!(bench.reading().anchors, 0);
+        bench.rest(1);
+        assert_eq!(bench.reading().anchors, 1);
+        bench.rest(700);
+        assert_eq!(bench.reading().anchors, 1);
     }
 
     #[test]
