@@ -1111,8 +1111,9 @@ impl Measurement {
         self.average.push(&configuration.average, &reading);
         // At the sensor's end, at a rail or without a supply neither channel sees what flows: anything within full scale.
         let validity = self.current_validity(reading.validity);
-        let blind = Validity::SATURATED.and(Validity::SUPPLY);
-        let off = if validity.bits() & blind.bits() != 0 {
+        let is_blind =
+            validity.contains(Validity::SATURATED) || validity.contains(Validity::SUPPLY);
+        let off = if is_blind {
             let shown = reading.current.saturating_abs();
             configuration.meter.full_scale.large.saturating_add(shown)
         } else {

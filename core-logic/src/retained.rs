@@ -387,6 +387,7 @@ fn decode<T: DeserializeOwned>(kind: u8, bytes: &[u8]) -> Result<T, RetainedErro
 
 /// The value, and what lies between it and the CRC.
 fn read<T: DeserializeOwned>(kind: u8, bytes: &[u8]) -> Result<(T, &[u8]), RetainedError> {
+    // `split_last_chunk` would bring a panic into the image.
     let [body @ .., c0, c1, c2, c3] = bytes else {
         return Err(RetainedError::TooShort);
     };

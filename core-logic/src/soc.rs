@@ -725,12 +725,11 @@ impl Blend {
         let (prior, table) = (prior.min(1_000_000), table.clamp(1, 1_000_000));
         let (prior2, table2) = (prior * prior, table * table);
         let sum = prior2 + table2;
-        let weight = (prior2 * 1_000_000 + sum / 2).checked_div(sum).unwrap_or(0);
         let width = prior * table / isqrt(sum).max(1);
         // The table's error is common to every reading of it: below 1/√2 of it nothing is gained by repetition.
         let floor = prior.min(table * 707_107 / 1_000_000);
         Self {
-            weight_ppm: i64::try_from(weight).unwrap_or(0),
+            weight_ppm: div_round((prior2 * 1_000_000).cast_signed(), sum.cast_signed()),
             width: i64::try_from(width.max(floor)).unwrap_or(i64::MAX),
         }
     }

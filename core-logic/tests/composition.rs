@@ -430,6 +430,24 @@ fn a_closed_loop_sensor_without_relations_says_so() {
 }
 
 /// D4 by order of a host: points over the supply at 0 A and at the test current, then the relations.
+/// Seven supplies at 0 A and at 200 A, each taken as a point; `reference_v` is the converter's at a supply.
+fn sweep_supply(bench: &mut Bench, truth: &FrontEnd, reference_v: impl Fn(Microvolts) -> f64) {
+    for (amps, order) in [
+        (0, Order::SupplyPointAtZero),
+        (200, Order::SupplyPointAtCurrent),
+    ] {
+        for millivolts in [4_550, 4_700, 4_850, 5_000, 5_150, 5_300, 5_450] {
+            let supply = Microvolts::from_millivolts(millivolts);
+            bench.environment.supply = Some(supply);
+            let output = truth.voltage(Microamps::from_amps(amps), Range::Small, supply);
+            let output_v = f64::from(output.get()) * 1e-6;
+            bench.code = (output_v / reference_v(supply) * 32_768.0).round() as i16;
+            bench.run_ms(1_500);
+            assert_eq!(bench.order(order), Ok(()), "{millivolts} mV");
+        }
+    }
+}
+
 #[test]
 fn a_supply_sweep_by_orders_gives_the_relations() {
     let truth = closed_loop();
@@ -447,23 +465,7 @@ fn a_supply_sweep_by_orders_gives_the_relations() {
         bench.order(Order::SupplyPointAtZero),
         Err(Refusal::SupplyUnknown)
     );
-    for (amps, order) in [
-        (0, Order::SupplyPointAtZero),
-        (200, Order::SupplyPointAtCurrent),
-    ] {
-        for millivolts in [4_550, 4_700, 4_850, 5_000, 5_150, 5_300, 5_450] {
-            let supply = Microvolts::from_millivolts(millivolts);
-            bench.environment.supply = Some(supply);
-            let output = FrontEnd::ClosedLoop(truth).voltage(
-                Microamps::from_amps(amps),
-                Range::Small,
-                supply,
-            );
-            bench.code = (f64::from(output.get()) * 1e-6 / 5.0 * 32_768.0).round() as i16;
-            bench.run_ms(1_500);
-            assert_eq!(bench.order(order), Ok(()), "{millivolts} mV");
-        }
-    }
+    sweep_supply(&mut bench, &FrontEnd::ClosedLoop(truth), |_| 5.0);
     assert_eq!(bench.readings().supply_points, [7, 7]);
     assert_eq!(bench.readings().activity, Activity::SupplyCalibration);
     assert!(
@@ -540,19 +542,8 @@ fn a_swept_sensor_reads_0_a_whatever_its_zero_was_corrected_by_before() {
         a: Microvolts(10_000),
     };
     let mut bench = Bench::new(configuration);
-    for (amps, order) in [
-        (0, Order::SupplyPointAtZero),
-        (200, Order::SupplyPointAtCurrent),
-    ] {
-        for millivolts in [4_550, 4_700, 4_850, 5_000, 5_150, 5_300, 5_450] {
-            let supply = Microvolts::from_millivolts(millivolts);
-            bench.environment.supply = Some(supply);
-            let output = truth.voltage(Microamps::from_amps(amps), Range::Small, supply);
-            bench.code = (f64::from(output.get()) / f64::from(supply.get()) * 32_768.0) as i16;
-            bench.run_ms(1_500);
-            assert_eq!(bench.order(order), Ok(()), "{millivolts} mV");
-        }
-    }
+    let ratiometric = |supply: Microvolts| f64::from(supply.get()) * 1e-6;
+    sweep_supply(&mut bench, &truth, ratiometric);
     assert_eq!(bench.order(Order::FinishSupplyCalibration), Ok(()));
     let supply = design::SENSOR_NOMINAL_SUPPLY;
     bench.environment.supply = Some(supply);

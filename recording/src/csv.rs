@@ -73,7 +73,6 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
     let mut columns = vec![Ok(Vec::with_capacity(expected_rows)); names.len()];
     let mut line_numbers = table::Lines::default();
     let mut decimal = Decimal::new(separator);
-    let only = format!("one, as in line {header_line}, which is taken for the header");
     for (row, (number, line)) in lines.enumerate() {
         let mut fields = Fields::new(line, separator);
         for (column, (name, values)) in names.iter().zip(&mut columns).enumerate() {
@@ -84,6 +83,7 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
                     Kind::FieldCount,
                     Place::line(number),
                     format!("{column} {fields}"),
+                    // No line end follows: the text ends where the line does.
                     if line.as_bytes().as_ptr_range().end == text.as_bytes().as_ptr_range().end {
                         "one for each column of the header (the last line has no end: it may be cut)"
                     } else {
@@ -107,6 +107,7 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
         }
         let more = fields.count();
         if more > 0 {
+            let only = format!("one, as in line {header_line}, which is taken for the header");
             return Err(fault(
                 Kind::FieldCount,
                 Place::line(number),

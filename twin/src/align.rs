@@ -354,18 +354,7 @@ fn search(driven: &Signal, sensed: &Signal, rate: f64) -> Option<Found> {
     }
     // Edges that fall between two rows make many small valleys: look into the neighbouring ones.
     for smoothing_s in [fine.smoothing_s, 0.0] {
-        let smooth = fit.smooth(fine.shape, smoothing_s);
-        let middle = fine;
-        for index in -80_i32..=80 {
-            let offset_s = middle.offset_s + f64::from(index) / 40.0 * step_s;
-            let cost = fit.cost(&smooth, offset_s, middle.drift_s);
-            fine.take(Trial {
-                smoothing_s,
-                offset_s,
-                cost,
-                ..middle
-            });
-        }
+        fine.take(fit.nearby(fine, smoothing_s, step_s));
     }
     fine.take(fit.descend(fine, 0.05 * step_s));
     // A short lag looks like a shift by as much: what does without is as good, unless the squares are lower by more than chance.
@@ -981,22 +970,28 @@ impl Fit<'_> {
         2.0 * FASTEST_RATE * self.span_s + step_s
     }
 
-    /// The best fit near `from` on the reference as it was recorded.
-    fn without_smoothing(&self, from: Trial, step_s: f64) -> Trial {
-        if from.smoothing_s == 0.0 {
-            return from;
-        }
-        let smooth = self.smooth(from.shape, 0.0);
+    /// The best with this smoothing of the offsets up to two rows to either side, a fortieth of a row apart.
+    fn nearby(&self, from: Trial, smoothing_s: f64, step_s: f64) -> Trial {
+        let smooth = self.smooth(from.shape, smoothing_s);
         let mut best = Trial::worst();
         for index in -80_i32..=80 {
             let offset_s = from.offset_s + f64::from(index) / 40.0 * step_s;
             best.take(Trial {
-                smoothing_s: 0.0,
+                smoothing_s,
                 offset_s,
                 cost: self.cost(&smooth, offset_s, from.drift_s),
                 ..from
             });
         }
+        best
+    }
+
+    /// The best fit near `from` on the reference as it was recorded.
+    fn without_smoothing(&self, from: Trial, step_s: f64) -> Trial {
+        if from.smoothing_s == 0.0 {
+            return from;
+        }
+        let mut best = self.nearby(from, 0.0, step_s);
         let found = self.descend_from(best, 0.05 * step_s, |_| 0.0);
         best.take(found);
         best
