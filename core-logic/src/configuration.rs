@@ -21,6 +21,7 @@ use core::fmt;
 use crc::{CRC_32_ISO_HDLC, Crc, NoTable};
 use serde::{Deserialize, Serialize};
 
+use crate::converter::{ConverterConfigError, Gain};
 use crate::design_parameters::{TEMPERATURE_HIGH, TEMPERATURE_LOW};
 use crate::front_end::PerRange;
 use crate::range::Range;
@@ -48,7 +49,7 @@ pub enum Contradiction {
     /// The front end refuses its parameters.
     FrontEnd(crate::front_end::FrontEndError),
     /// The converter refuses its parameters.
-    Converter(crate::converter::ConverterConfigError),
+    Converter(ConverterConfigError),
     /// The zero drift in use is beyond its own limit.
     ZeroDrift,
     /// The threshold of the open sensor does not lie below every legal level.
@@ -267,11 +268,12 @@ impl Configuration {
     fn contradiction(&self) -> Option<Contradiction> {
         if let Err(violation) = self.front_end.validate() {
             Some(Contradiction::FrontEnd(violation))
-        } else if let Err(violation) = self.converter.validate() {
-            Some(Contradiction::Converter(violation))
-        } else if !self.zero_drift.is_valid() {
+        } else if self.converter.gain != Gain::X1 {
+            // Of what these parts refuse, the limits of single values are those of `FIELDS`, which have been looked at.
+            Some(Contradiction::Converter(ConverterConfigError::Gain))
+        } else if !self.zero_drift.value_is_within_limit() {
             Some(Contradiction::ZeroDrift)
-        } else if !self.open_sensor.is_valid(&self.front_end) {
+        } else if !self.open_sensor.threshold_is_valid(&self.front_end) {
             Some(Contradiction::OpenSensor)
         } else if !self.temperature_limits.is_sorted_by(|low, high| low < high) {
             Some(Contradiction::Temperature)
@@ -874,13 +876,35 @@ mod tests {
         assert_eq!(found.to_string(), "contradiction: FrontEnd(FullScale)");
     }
 
+    /// Each condition that the parts have beside those is of one value, and no value in the limits of [`FIELDS`] breaks it.
+    #[test]
+    fn the_parts_refuse_no_more_than_the_limits_and_the_contradictions() {
+        for field in FIELDS {
+            for element in 0..usize::from(field.layout.count) {
+                let (min, max) = field.limits();
+                for value in [min, max] {
+                    let mut c = Configuration::default();
+                    if field.put(&mut c, element, value).is_err() {
+                        continue;
+                    }
+                    let converter = c.converter.validate();
+                    assert_eq!(converter.is_ok(), c.converter.gain == Gain::X1, "{field:?}");
+                    let within = c.zero_drift.value_is_within_limit();
+                    assert_eq!(c.zero_drift.is_valid(), within, "{field:?}");
+                    let threshold = c.open_sensor.threshold_is_valid(&c.front_end);
+                    assert_eq!(c.open_sensor.is_valid(&c.front_end), threshold, "{field:?}");
+                }
+            }
+        }
+    }
+
     #[test]
     fn each_contradiction_is_found() {
         type Change = fn(&mut Configuration);
         let cases: [(Change, Contradiction); 12] = [
             (
                 |c| c.converter.gain = crate::converter::Gain::X2,
-                Contradiction::Converter(crate::converter::ConverterConfigError::Gain),
+                Contradiction::Converter(ConverterConfigError::Gain),
             ),
             (
                 |c| c.zero_drift.value.small = Microamps(c.zero_drift.limit.small.get() + 1),

@@ -524,14 +524,14 @@ impl FrontEnd {
 
 /// D3's network with the sensor connected: 0.225 · Vhall + 1.65 V, in nV.
 pub(crate) const fn network_output_nanovolts(hall_nanovolts: i64) -> i64 {
-    let (gain, per) = design::NETWORK_GAIN;
     // (Vref · R4 / (R3 + R4)) · (1 + R1/R2)
-    let reference = mul_div(
+    const REFERENCE: i64 = mul_div(
         design::NETWORK_REFERENCE.get() as i64 * 1_000 * design::R4_OHM,
         design::R1_OHM + design::R2_OHM,
         (design::R3_OHM + design::R4_OHM) * design::R2_OHM,
     );
-    add_i64(mul_div(hall_nanovolts, gain, per), reference)
+    let (gain, per) = design::NETWORK_GAIN;
+    add_i64(mul_div(hall_nanovolts, gain, per), REFERENCE)
 }
 
 #[cfg(test)]

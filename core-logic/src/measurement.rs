@@ -387,7 +387,7 @@ pub fn effective_meter_config(
                 (factor, i64::from(supply.get()) * 500)
             }
             // Its sensor runs from ±15 V.
-            FrontEnd::Network(_) => (one, network_output_nanovolts(0)),
+            FrontEnd::Network(_) => (one, const { network_output_nanovolts(0) }),
         };
         let factors = if range == KeyCalibration::RANGE || !configuration.front_end.has_two_ranges()
         {
@@ -1705,7 +1705,7 @@ impl Measurement {
 /// The Hall output behind a network voltage: (V − 1.65 V) / 0.225.
 fn hall_voltage(network: Microvolts) -> Microvolts {
     let (gain, per) = design::NETWORK_GAIN;
-    let above = network.saturating_sub(crate::open_sensor::network_output(Microvolts::ZERO));
+    let above = network.saturating_sub(crate::open_sensor::AT_GROUND);
     Microvolts(clamp_i32(mul_div(i64::from(above.get()), per, gain)))
 }
 

@@ -47,6 +47,10 @@ pub const fn network_output_open_without_pull_down() -> Microvolts {
     amplified(design::NETWORK_REFERENCE.get() as i64 * 1_000)
 }
 
+/// [`network_output_open`], and [`network_output`] of 0 V.
+const OPEN: Microvolts = network_output_open();
+pub(crate) const AT_GROUND: Microvolts = network_output(Microvolts::ZERO);
+
 /// The amplifier's 1 + R1/R2, nV to µV.
 const fn amplified(input_nanovolts: i64) -> Microvolts {
     Microvolts(clamp_i32(mul_div(
@@ -90,14 +94,18 @@ impl OpenSensorConfig {
     /// level and the lowest level of `front_end`.
     #[must_use]
     pub fn is_valid(&self, front_end: &FrontEnd) -> bool {
-        let legal = legal_at_network(front_end, design::SENSOR_NOMINAL_SUPPLY);
         self.set_count > 0
             && self.clear_count > 0
             && self.set_time_ms <= 10_000
             && self.clear_time_ms <= 10_000
-            && self
-                .open_below
-                .is_none_or(|level| level > network_output_open() && level < legal.low)
+            && self.threshold_is_valid(front_end)
+    }
+
+    /// Whether the threshold lies there; the rest are limits of each value alone.
+    pub(crate) fn threshold_is_valid(&self, front_end: &FrontEnd) -> bool {
+        let legal = legal_at_network(front_end, design::SENSOR_NOMINAL_SUPPLY);
+        self.open_below
+            .is_none_or(|level| level > OPEN && level < legal.low)
     }
 }
 
@@ -154,9 +162,7 @@ impl OpenSensorThresholds {
             .unwrap_or(design::SENSOR_NOMINAL_SUPPLY)
             .clamp(design::SENSOR_SUPPLY_LOW, design::SENSOR_SUPPLY_HIGH);
         let legal = legal_at_network(front_end, supply);
-        let open_below = config
-            .open_below
-            .unwrap_or_else(|| middle(network_output_open(), legal.low));
+        let open_below = config.open_below.unwrap_or_else(|| middle(OPEN, legal.low));
         let (low_rail_below, high_rail_above, converter) = match front_end {
             // Its output stage runs from ±15 V: the negative rail is below the open level, the positive one is clamped.
             FrontEnd::Network(_) => (open_below, middle(legal.high, design::NETWORK_CLAMP), None),
@@ -175,7 +181,7 @@ impl OpenSensorThresholds {
                     }
                 };
                 (
-                    middle(network_output(Microvolts::ZERO), legal.low),
+                    middle(AT_GROUND, legal.low),
                     middle(legal.high, network_output(supply)),
                     Some(PerRange {
                         small: between_rails(Range::Small),

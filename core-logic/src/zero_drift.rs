@@ -65,9 +65,14 @@ impl ZeroDriftConfig {
             && positive(self.max_meter_mean)
             && (SAMPLE_LIMITS.0..=SAMPLE_LIMITS.1).contains(&self.samples)
             && self.timeout_ms > 0
-            && [Range::Small, Range::Large]
-                .into_iter()
-                .all(|range| self.check_value(range, self.value.get(range)).is_ok())
+            && self.value_is_within_limit()
+    }
+
+    /// Whether the zero drift in use is; the rest are limits of each value alone.
+    pub(crate) fn value_is_within_limit(&self) -> bool {
+        [Range::Small, Range::Large]
+            .into_iter()
+            .all(|range| self.check_value(range, self.value.get(range)).is_ok())
     }
 
     /// Checks a value that a host wants to set.
