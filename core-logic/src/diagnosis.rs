@@ -289,6 +289,35 @@ impl CodeSet {
     /// Every code there is.
     pub const ALL: Self = Self((1 << Code::COUNT) - 1);
 
+    /// Those that stand against the charge, and the meter's mean with it.
+    pub const AGAINST_CHARGE: Self = Self::against(true);
+
+    /// Those that stand against the current, without those that each reading says of itself: readings that look sound are none.
+    pub const AGAINST_SOUND_READINGS: Self = Self::against(false)
+        .without(Self::of(Code::SensorSaturated))
+        .without(Self::of(Code::ConverterNoAnswer))
+        .without(Self::of(Code::ConverterConfigurationLost))
+        .without(Self::of(Code::RateImplausible));
+
+    /// Those that stand against the charge, or against the current.
+    const fn against(charge: bool) -> Self {
+        let (mut bits, mut bit) = (0, 1);
+        let mut rules: &[Rule] = &RULES;
+        while let [rule, rest @ ..] = rules {
+            let effects = &rule.effects;
+            let causes = if charge {
+                effects.charge
+            } else {
+                effects.current
+            };
+            if !causes.is_valid() {
+                bits |= bit;
+            }
+            (rules, bit) = (rest, bit << 1);
+        }
+        Self(bits)
+    }
+
     const fn of(code: Code) -> Self {
         Self(1 << code.number())
     }
@@ -324,6 +353,12 @@ impl CodeSet {
     #[must_use]
     pub const fn union(self, other: Self) -> Self {
         Self(self.0 | other.0)
+    }
+
+    /// The codes that are in both sets.
+    #[must_use]
+    pub const fn intersection(self, other: Self) -> Self {
+        Self(self.0 & other.0)
     }
 
     /// This set without `other`.
@@ -562,6 +597,18 @@ mod tests {
         let mut set = CodeSet::EMPTY;
         set.set(code, true);
         set
+    }
+
+    #[test]
+    fn sets_by_what_the_codes_stand_against() {
+        for code in Code::ALL {
+            let effects = code.rule().effects;
+            let charge = CodeSet::AGAINST_CHARGE.contains(code);
+            assert_eq!(charge, !effects.charge.is_valid(), "{code:?}");
+            let current = CodeSet::AGAINST_SOUND_READINGS.contains(code);
+            assert!(!current || !effects.current.is_valid(), "{code:?}");
+        }
+        assert_eq!(CodeSet::AGAINST_SOUND_READINGS.len(), 9);
     }
 
     #[test]

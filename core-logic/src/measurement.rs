@@ -302,6 +302,10 @@ pub struct Measurement {
     /// As much of the charge's doubt as the state of charge has in its own.
     doubted: Nanocoulombs,
     meter_causes: Validity,
+    /// Against a mean of the meter that began before the last fault in its charge ended …
+    mean_causes: Validity,
+    /// … which was then.
+    faulty_until: Instant,
     /// Of the [`Basis`] and the configuration that the factors are worked out of: counts their changes, from 1.
     basis_number: u32,
     /// [`Measurement::meter_config`] is to be handed to the meter's owner.
@@ -531,6 +535,8 @@ impl Measurement {
             unseen: Miscounted::NONE,
             doubted: Nanocoulombs::ZERO,
             meter_causes: Validity::STALE,
+            mean_causes: Validity::VALID,
+            faulty_until: now,
             basis_number: 1,
             meter_calibration_due: true,
             zero: ZeroCalibration::new(),
@@ -896,9 +902,18 @@ impl Measurement {
         let conditions = self.conditions(configuration).union(external);
         let changes = self.diagnosis.step(now, conditions);
         self.effects = self.diagnosis.effects();
-        if changes.cleared.contains(Code::FlagImplausible) {
-            // At a slow rate its conversions reach back beyond what was read by the wrong scale.
+        // A mean over longer than the diagnosis stands has readings of the fault in it: the average begins anew, the meter's is
+        // waited for.
+        let ended = changes.cleared;
+        if !ended
+            .intersection(CodeSet::AGAINST_SOUND_READINGS)
+            .is_empty()
+        {
             self.average.clear();
+        }
+        let faults = self.diagnosis.active().intersection(conditions);
+        if !faults.intersection(CodeSet::AGAINST_CHARGE).is_empty() {
+            (self.mean_causes, self.faulty_until) = (self.effects.charge, now);
         }
         Tick {
             hv_permit: self.key_outputs.hv_permit,
@@ -1415,6 +1430,12 @@ impl Measurement {
         self.meter_causes.and(self.effects.charge)
     }
 
+    /// Of the meter's mean: of its charge, and of what the mean's window still has of a fault.
+    fn mean_validity(&self) -> Validity {
+        self.charge_validity()
+            .and_if(self.meter.mean_begun <= self.faulty_until, self.mean_causes)
+    }
+
     /// It follows the meter: what is missing there is missing here. Before the meter's first reading what was restored
     /// stands.
     fn soc_validity(&self) -> Validity {
@@ -1493,7 +1514,7 @@ impl Measurement {
         can::MeterCurrent {
             current: self.meter.mean_current,
             validity: self
-                .charge_validity()
+                .mean_validity()
                 .and_if(self.meter.mean_over.is_zero(), Validity::STALE),
             below_no_load: self.meter.below_no_load,
             charge_uncertainty: Some(self.charge_uncertainty()),
@@ -1645,7 +1666,7 @@ impl Measurement {
         readings.meter_current = self.meter.mean_current;
         readings.current_validity = self.current_validity(self.reading.validity);
         readings.average_validity = average_validity;
-        readings.charge_validity = self.charge_validity();
+        readings.charge_validity = self.mean_validity();
         readings.conversions = self.conversions;
         readings.sensor_voltage = self.reading.volts;
         readings.range = self.history.range;

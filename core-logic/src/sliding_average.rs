@@ -5,6 +5,7 @@
 //!   [`Average::covers`] tell what the average stands for.
 //! - **Gap.** When no valid reading came for longer than [`SlidingAverageConfig::max_gap_ms`], what is stored describes
 //!   another time: the average is empty until a valid reading starts it anew.
+//! - **Fault.** Readings that looked sound and were none are in it when a fault is found: its owner empties it when that ends.
 //! - **Range change.** Currents are amperes whichever sensor gave them, so the window spans a range change; the
 //!   readings around the edge are invalid and stay out.
 

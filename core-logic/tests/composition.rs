@@ -51,6 +51,8 @@ struct Bench {
     tick: Option<Tick>,
     /// Nobody takes what is found, as while the firmware's RS485 task waits.
     leaves_found: bool,
+    /// The meter's mean and when its window began; `None` for what flows now.
+    mean: Option<(Microamps, Instant)>,
 }
 
 impl Bench {
@@ -93,6 +95,7 @@ impl Bench {
             },
             tick: None,
             leaves_found: false,
+            mean: None,
         }
     }
 
@@ -139,8 +142,12 @@ impl Bench {
                     .on_environment(&self.configuration, self.environment, &seen, now);
                 self.report.at = Some(now);
                 self.report.mean_begun = now;
+                let mut report = self.report;
+                if let Some((mean, begun)) = self.mean {
+                    (report.mean_current, report.mean_begun) = (mean, begun);
+                }
                 self.measurement
-                    .on_meter(&self.configuration, &self.report, Validity::VALID);
+                    .on_meter(&self.configuration, &report, Validity::VALID);
                 let tick = self.measurement.tick(
                     &self.configuration,
                     now,
@@ -1733,6 +1740,72 @@ fn means_are_no_longer_than_what_is_known_to_be_right() {
     }
     let average = bench.measurement.current_average(&bench.configuration);
     assert_eq!((average.validity, average.samples), (Validity::VALID, 64));
+}
+
+/// An open sensor, whose level is a legal one all the same: 0 A in place of 30 A. The average's window is of two seconds, the
+/// meter's of five.
+#[test]
+fn no_mean_that_has_something_of_a_fault_in_it_is_valid() {
+    let mut configuration = Configuration::default();
+    configuration.average.length = 64;
+    let mut bench = Bench::new(configuration);
+    let level = |bench: &mut Bench, network, code, amps| {
+        bench.environment.network = Some(network);
+        bench.code = code;
+        bench.report.mean_current = Microamps::from_amps(amps);
+    };
+    let sound = network_output(Microvolts::from_millivolts(3_625));
+    level(&mut bench, sound, 5_939, 30);
+    bench.count_ms(3_000);
+    let begun = Instant::from_ticks(bench.now);
+    level(&mut bench, network_output_open(), 4_096, 0);
+    bench.count_ms(1_000);
+    assert!(bench.has(Code::OpenSensor));
+    level(&mut bench, sound, 5_939, 30);
+    let ended = bench.now;
+    for since_ms in (0..10_000).step_by(10) {
+        // Of the five seconds it was open for one.
+        bench.mean = match since_ms {
+            0..4_000 => None,
+            4_000..9_000 => Some((24, begun)),
+            _ => Some((30, Instant::from_ticks(ended + 4_000_000))),
+        }
+        .map(|(amps, begun)| (Microamps::from_amps(amps), begun));
+        bench.count_ms(10);
+        let average = bench.measurement.current_average(&bench.configuration);
+        let meter = bench.measurement.meter_current();
+        let on_modbus = bench.readings();
+        for (mean, validity) in [
+            (average.average, average.validity),
+            (meter.current, meter.validity),
+            (on_modbus.meter_current, on_modbus.charge_validity),
+        ] {
+            let off = mean.saturating_sub(Microamps::from_amps(30));
+            assert!(
+                !validity.is_valid() || off.saturating_abs() < Microamps::from_amps(1),
+                "{since_ms} ms: {mean:?}, {validity:?}"
+            );
+        }
+    }
+    let average = bench.measurement.current_average(&bench.configuration);
+    assert_eq!((average.validity, average.samples), (Validity::VALID, 64));
+    let meter = bench.measurement.meter_current();
+    assert_eq!(meter.validity, Validity::VALID);
+}
+
+/// What a reading carries itself does not enter: one that is saturated costs the average no more than its place.
+#[test]
+fn a_bad_reading_does_not_empty_the_average() {
+    let mut bench = Bench::new(Configuration::default());
+    bench.run_ms(3_000);
+    bench.code = 8_191;
+    bench.run_ms(32);
+    bench.code = 4_096;
+    bench.run_ms(20);
+    assert!(bench.has(Code::SensorSaturated));
+    bench.run_ms(200);
+    let average = bench.measurement.current_average(&bench.configuration);
+    assert_eq!((average.validity, average.samples), (Validity::VALID, 8));
 }
 
 /// A sensor beyond its range, and one at a rail: both channels see the same, and neither what flows.
