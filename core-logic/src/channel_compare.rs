@@ -25,7 +25,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::design_parameters::LARGE_FULL_SCALE;
 use crate::error_budget;
 use crate::front_end::PerRange;
 use crate::meter::{MeterReport, energy_difference};
@@ -202,8 +201,8 @@ struct Window {
 struct SupplyDoubt {
     /// Of the current.
     share: Ppm,
-    /// Of the sensor's output at 0 A.
-    share_at_zero: Ppm,
+    /// That share of the sensor's output at 0 A.
+    at_zero: PerRange<Microamps>,
     /// Readings of the supply for which it still holds.
     readings: u8,
 }
@@ -284,7 +283,7 @@ impl ChannelCompare {
             not_before: Instant::from_ticks(0),
             supply_doubt: SupplyDoubt {
                 share: Ppm(0),
-                share_at_zero: Ppm(0),
+                at_zero: PerRange::both(Microamps::ZERO),
                 readings: 0,
             },
             report: CompareReport {
@@ -304,11 +303,12 @@ impl ChannelCompare {
         self.report
     }
 
-    /// Takes a conversion, usable or not.
+    /// Takes a conversion, usable or not. No more than `full_scale` flows, the larger sensor's.
     pub fn on_conversion(
         &mut self,
         config: &CompareConfig,
         conversion: &Conversion,
+        full_scale: Microamps,
     ) -> CompareReport {
         if !conversion.usable {
             if let Some((_, spoiled)) = &mut self.last {
@@ -318,7 +318,7 @@ impl ChannelCompare {
         }
         let Some((previous, spoiled)) = self.last else {
             // Of what flowed since the newest conversion before nobody has seen anything.
-            self.follow(LARGE_FULL_SCALE, conversion.finished);
+            self.follow(full_scale, conversion.finished);
             self.last = Some((*conversion, false));
             self.pending = None;
             return self.report;
@@ -474,14 +474,14 @@ impl ChannelCompare {
     }
 
     /// The newest reading of the sensor's supply is off by `share` from what the channels take it for; 0 within its noise. The bound is
-    /// wider by the largest of `SUPPLY_DOUBT_READINGS`; and by `share_at_zero` of the sensor's output at 0 A, where a channel has
+    /// wider by the largest of `SUPPLY_DOUBT_READINGS`; and by `at_zero`, that share of the sensor's output at 0 A, where a channel has
     /// that from the supply too.
-    pub fn on_supply(&mut self, share: Ppm, share_at_zero: Ppm) {
+    pub fn on_supply(&mut self, share: Ppm, at_zero: PerRange<Microamps>) {
         let doubt = &mut self.supply_doubt;
         if share >= doubt.share || doubt.readings == 0 {
             *doubt = SupplyDoubt {
                 share,
-                share_at_zero,
+                at_zero,
                 readings: SUPPLY_DOUBT_READINGS,
             };
         } else {
@@ -546,12 +546,7 @@ impl ChannelCompare {
             ),
             i64::from(Ppm::ONE.get()),
         );
-        // ADC1 reads less than 7 V: 2 V of 4.5 V are less than 2³¹ here.
-        let at_zero = self
-            .supply_doubt
-            .share_at_zero
-            .get()
-            .wrapping_mul(error_budget::ZERO_AMPS.get(range));
+        let at_zero = self.supply_doubt.at_zero.get(range).get();
         let zero = config.zero_tolerance.get(range).get().max(0);
         let doubt = gain.wrapping_add(charge_of(i64::from(zero.saturating_add(at_zero)), time));
         self.integral.charge = self.integral.charge.wrapping_add(charge);
@@ -719,6 +714,7 @@ fn close(
 #[allow(clippy::unwrap_used, clippy::panic, clippy::cast_possible_truncation)]
 mod tests {
     use super::*;
+    use crate::design_parameters::LARGE_FULL_SCALE;
     use proptest::prelude::*;
 
     const PERIOD: u64 = 31_250;
@@ -812,7 +808,9 @@ mod tests {
                         range: self.range,
                         usable: self.usable,
                     };
-                    let _ = self.compare.on_conversion(&self.config, &conversion);
+                    let _ = self
+                        .compare
+                        .on_conversion(&self.config, &conversion, LARGE_FULL_SCALE);
                     self.next_conversion += self.period;
                 }
                 if self.now == self.next_meter {
@@ -1054,15 +1052,15 @@ mod tests {
             range: Range::Small,
             usable: true,
         };
-        let _ = compare.on_conversion(&config, &conversion(0, 100));
-        let _ = compare.on_conversion(&config, &conversion(100, 200));
+        let _ = compare.on_conversion(&config, &conversion(0, 100), LARGE_FULL_SCALE);
+        let _ = compare.on_conversion(&config, &conversion(100, 200), LARGE_FULL_SCALE);
         let once = compare.integral;
         assert_eq!((once.charge, once.covered), (100, 100));
-        let _ = compare.on_conversion(&config, &conversion(100, 200));
-        let _ = compare.on_conversion(&config, &conversion(300, 250));
+        let _ = compare.on_conversion(&config, &conversion(100, 200), LARGE_FULL_SCALE);
+        let _ = compare.on_conversion(&config, &conversion(300, 250), LARGE_FULL_SCALE);
         assert_eq!(compare.integral, once);
         // A gap is interpolated.
-        let _ = compare.on_conversion(&config, &conversion(250, 300));
+        let _ = compare.on_conversion(&config, &conversion(250, 300), LARGE_FULL_SCALE);
         assert_eq!(compare.integral.covered, 200);
         assert_eq!(compare.integral.charge, 200);
     }
@@ -1221,7 +1219,7 @@ mod tests {
                     current: Microamps(current),
                     range: Range::from_flag(flags[0]),
                     usable: flags[1],
-                });
+                }, Microamps(signed[0]));
                 let _ = compare.on_meter(&config, &MeterReport {
                     at: flags[2].then_some(at(times[2])),
                     energy: if flags[0] { current } else { 0 },

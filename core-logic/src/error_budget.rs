@@ -182,16 +182,6 @@ const fn small_current(microvolts: i64) -> i64 {
     )
 }
 
-/// The sensors' output at 0 A, as a current in A, rounded up: a supply that is off by 1 ppm is wrong by so many µA at 0 A.
-#[expect(clippy::cast_possible_truncation, reason = "67 and 670")]
-pub const ZERO_AMPS: PerRange<i32> = {
-    let small = small_current(design::SENSOR_ZERO.get() as i64) / 1_000_000 + 1;
-    PerRange {
-        small: small as i32,
-        large: (small * RATIO) as i32,
-    }
-};
-
 /// An error of the two divider resistors against each other, as an error of the divided voltage.
 const fn divided(error: i64) -> i64 {
     let reference = design::REFERENCE.get() as i64;

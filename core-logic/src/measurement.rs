@@ -302,10 +302,6 @@ pub struct Measurement {
     /// As much of the charge's doubt as the state of charge has in its own.
     doubted: Nanocoulombs,
     meter_causes: Validity,
-    /// Against a mean of the meter that began before the last fault in its charge ended …
-    mean_causes: Validity,
-    /// … which was then.
-    faulty_until: Instant,
     /// Of the [`Basis`] and the configuration that the factors are worked out of: counts their changes, from 1.
     basis_number: u32,
     /// [`Measurement::meter_config`] is to be handed to the meter's owner.
@@ -350,6 +346,10 @@ pub struct Measurement {
     sweep: Option<SupplyCalibration>,
     average: SlidingAverage,
     prepared: Prepared,
+    /// Against a mean of the meter that began before the last fault in its charge ended …
+    mean_causes: Validity,
+    /// … which was then.
+    faulty_until: Instant,
 }
 
 /// The meter's configuration with everything that is known about the sensor in front of it: zero drift, key-state
@@ -478,6 +478,18 @@ pub fn prepare(configuration: &Configuration, basis: &Basis) -> Prepared {
 #[inline(never)]
 fn is_beyond(a: Microvolts, b: Microvolts, limit: Microvolts) -> bool {
     a.get().abs_diff(b.get()) >= limit.get().unsigned_abs()
+}
+
+/// A share of the sensor's output at 0 A, as a current: 2.5 V, where the meter's full scale is 2.25 V. Rounded up to 67 of 60, as D0's
+/// sensors have 67 and 670 A.
+#[inline(never)]
+fn share_of_zero_output(meter_full_scale: Microamps, share: Ppm) -> Microamps {
+    let rounded_up = 67 * i64::from(meter_full_scale.get());
+    Microamps(clamp_i32(mul_div(
+        rounded_up,
+        share.get().into(),
+        60_000_000,
+    )))
 }
 
 /// When the meter counts by factors that change at `now`.
@@ -1126,11 +1138,14 @@ impl Measurement {
         self.average.push(&configuration.average, &reading);
         // At the sensor's end, at a rail or without a supply neither channel sees what flows: anything within full scale.
         let validity = self.current_validity(reading.validity);
+        let full_scale = configuration.front_end.full_scale(Range::Large);
         let is_blind =
             validity.contains(Validity::SATURATED) || validity.contains(Validity::SUPPLY);
         let off = if is_blind {
             let shown = reading.current.saturating_abs();
-            configuration.meter.full_scale.large.saturating_add(shown)
+            // What the meter can count, or the sensor show.
+            let full_scale = configuration.meter.full_scale.large.max(full_scale);
+            full_scale.saturating_add(shown)
         } else {
             Microamps::ZERO
         };
@@ -1160,6 +1175,7 @@ impl Measurement {
                 },
                 usable: reading.validity.is_valid(),
             },
+            full_scale,
         );
         let conditions = self.zero_conditions();
         match self
@@ -1218,6 +1234,7 @@ impl Measurement {
                 passed_as_small: self.prepared.converter.current(code, Range::Small),
                 passed_as_large: self.prepared.converter.current(code, Range::Large),
                 small_sensor: own,
+                full_scale: configuration.front_end.full_scale(Range::Large),
             },
         );
     }
@@ -1239,8 +1256,13 @@ impl Measurement {
             let off = newest.saturating_sub(used).saturating_abs();
             let off = if off < SUPPLY_DOUBT { 0 } else { off.get() };
             let share = Ppm(off / SUPPLY_PPM);
-            self.compare
-                .on_supply(share, if at_zero { share } else { Ppm(0) });
+            let share_at_zero = if at_zero { share } else { Ppm::ZERO };
+            let full_scale = &configuration.meter.full_scale;
+            let off_at_zero = PerRange {
+                small: share_of_zero_output(full_scale.small, share_at_zero),
+                large: share_of_zero_output(full_scale.large, share_at_zero),
+            };
+            self.compare.on_supply(share, off_at_zero);
             if !is_beyond(mean, used, SUPPLY_STEP) {
                 return;
             }
@@ -1742,6 +1764,16 @@ mod tests {
 
     fn at(us: u64) -> Instant {
         Instant::from_ticks(us)
+    }
+
+    #[test]
+    fn d0s_output_at_0_amps_is_that_of_its_budget() {
+        let full_scale = Configuration::default().meter.full_scale;
+        for share in [0, 1, 4_444, 444_444] {
+            let of = |range| share_of_zero_output(full_scale.get(range), Ppm(share));
+            let (small, large) = (of(Range::Small), of(Range::Large));
+            assert_eq!((small.get(), large.get()), (67 * share, 670 * share));
+        }
     }
 
     /// F22.

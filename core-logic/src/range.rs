@@ -410,6 +410,8 @@ pub struct FlagObservation {
     /// The small sensor's own reading through the open-sensor network, which does not pass the analog switch. `None`
     /// without that channel or while the sensor is reported open.
     pub small_sensor: Option<Microamps>,
+    /// What may flow at most: the large sensor's full scale.
+    pub full_scale: Microamps,
 }
 
 /// The verdict on flag against level.
@@ -600,7 +602,7 @@ fn off_by(
             .saturating_abs()
             .saturating_add(config.margin_below.saturating_abs()),
         // The small sensor is at its end, and what is passed is no sensor's level: anything may flow.
-        (None, Some(_)) => design::LARGE_FULL_SCALE.saturating_add(by_flag.saturating_abs()),
+        (None, Some(_)) => seen.full_scale.saturating_add(by_flag.saturating_abs()),
     }
 }
 
@@ -910,6 +912,7 @@ mod tests {
             passed_as_small: microamps(level_as_small),
             passed_as_large: microamps(level_as_small * 10.0),
             small_sensor: small_sensor.map(microamps),
+            full_scale: design::LARGE_FULL_SCALE,
         }
     }
 
@@ -1090,6 +1093,7 @@ mod tests {
                     passed_as_small: microamps(level),
                     passed_as_large: microamps(10.0 * level),
                     small_sensor: network.then(|| microamps(amps.clamp(-66.0, 66.0))),
+                    full_scale: design::LARGE_FULL_SCALE,
                 },
             );
         }
@@ -1216,6 +1220,7 @@ mod tests {
                     passed_as_small: Microamps(currents[5]),
                     passed_as_large: Microamps(currents[6]),
                     small_sensor: flag.then_some(Microamps(currents[7])),
+                    full_scale: Microamps(currents[1]),
                 });
             }
         }

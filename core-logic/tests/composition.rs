@@ -10,12 +10,13 @@
 )]
 
 use core_logic::can::BatteryVoltage;
+use core_logic::channel_compare::Outcome;
 use core_logic::configuration::Configuration;
 use core_logic::converter::{ConverterSample, SupplyMode};
 use core_logic::design_parameters as design;
 use core_logic::diagnosis::{Code, CodeSet};
 use core_logic::front_end::{
-    ClosedLoop, DualRange, FrontEnd, Hah1bv, KeyFactors, Network, SupplyRelations,
+    ClosedLoop, DualRange, FrontEnd, Hah1bv, KeyFactors, Network, PerRange, SupplyRelations,
 };
 use core_logic::key_calibration::{KeyPhase, KeyState};
 use core_logic::measurement::{
@@ -1791,6 +1792,69 @@ fn no_mean_that_has_something_of_a_fault_in_it_is_valid() {
     assert_eq!((average.validity, average.samples), (Validity::VALID, 64));
     let meter = bench.measurement.meter_current();
     assert_eq!(meter.validity, Validity::VALID);
+}
+
+/// A large sensor of 1,800 A, whose output at 0 A is as much as 2,000 A.
+#[test]
+fn bounds_follow_the_full_scale_of_the_sensors() {
+    let front_end = FrontEnd::DualRange(DualRange {
+        full_scale: PerRange {
+            small: design::SMALL_FULL_SCALE,
+            large: Microamps::from_amps(1_800),
+        },
+        ..DualRange::default()
+    });
+    let bound = |bench: &Bench| bench.readings().charge_uncertainty.get() / 1_000_000_000;
+    let mut configuration = with_front_end(front_end);
+    configuration.validate().unwrap();
+    // A level that is neither sensor's, and the small one at its end: anything may flow.
+    let mut bench = Bench::new(configuration);
+    bench.range = Range::Large;
+    bench.run_ms(3_000);
+    bench.environment.network = Some(network_output(Microvolts::from_millivolts(4_800)));
+    bench.run_ms(500);
+    assert!(bench.has(Code::FlagImplausible));
+    let before = bound(&bench);
+    bench.run_ms(1_000);
+    let declared = bound(&bench) - before;
+    assert!((1_750..1_900).contains(&declared), "{declared} C");
+
+    // The meter stands still, and for most of a second no converter sees what flows.
+    let mut bench = Bench::new(configuration);
+    bench.range = Range::Large;
+    bench.environment.network = Some(network_output(Microvolts::from_millivolts(4_800)));
+    bench.code = 4_096 + 205;
+    bench.report.mean_current = Microamps::from_amps(100);
+    bench.count_ms(3_000);
+    bench.run_ms(1_500);
+    assert!(bench.has(Code::MeterFrozen));
+    let before = bound(&bench);
+    bench.next_conversion = u64::MAX;
+    bench.run_ms(800);
+    bench
+        .measurement
+        .configuration_changed(&bench.configuration);
+    bench.next_conversion = bench.now + PERIOD_US;
+    bench.run_ms(100);
+    let declared = bound(&bench) - before;
+    assert!((1_400..1_650).contains(&declared), "{declared} C");
+
+    // Each other reading of the supply is 40 mV higher: 20 mV of its mean, 0.4 %, are 8 A at 0 A.
+    configuration.converter.supply_mode = SupplyMode::Measured;
+    let mut bench = Bench::new(configuration);
+    bench.range = Range::Large;
+    bench.code = 4_112;
+    for reading in 0..1_000 {
+        let millivolts = 5_000 + reading % 2 * 40;
+        bench.environment.supply = Some(Microvolts::from_millivolts(millivolts));
+        bench.run_ms(10);
+    }
+    let (Outcome::Agree { bound, .. } | Outcome::Disagree { bound, .. }) =
+        bench.measurement.compare_report().fast
+    else {
+        panic!("{:?}", bench.measurement.compare_report());
+    };
+    assert!(bound >= Nanocoulombs::from_coulombs(8), "{bound:?}");
 }
 
 /// What a reading carries itself does not enter: one that is saturated costs the average no more than its place.
