@@ -62,6 +62,8 @@ pub enum Contradiction {
     KeyCalibrationDelay,
     /// The slow window of the channels' comparison is not longer than the fast one, or that is shorter than two conversions.
     CompareWindows,
+    /// The comparators would switch where the small sensor of two is at the end of its range, or beyond.
+    SwitchingCurrent,
     /// A storm's window or hold-off is too short for its events.
     Storm,
     /// The open-circuit table is not usable.
@@ -284,6 +286,10 @@ impl Configuration {
                 < 2 * self.converter.period(self.front_end.channel()).as_ticks()
         {
             Some(Contradiction::CompareWindows)
+        } else if self.front_end.has_two_ranges()
+            && self.meter.switching_current >= self.front_end.full_scale(Range::Small)
+        {
+            Some(Contradiction::SwitchingCurrent)
         } else if !self.edge_storm.is_valid() || !self.meter_line_storm.is_valid() {
             Some(Contradiction::Storm)
         } else if self.derived() != self.repeated() {
@@ -901,7 +907,7 @@ mod tests {
     #[test]
     fn each_contradiction_is_found() {
         type Change = fn(&mut Configuration);
-        let cases: [(Change, Contradiction); 12] = [
+        let cases: [(Change, Contradiction); 13] = [
             (
                 |c| c.converter.gain = crate::converter::Gain::X2,
                 Contradiction::Converter(ConverterConfigError::Gain),
@@ -945,6 +951,10 @@ mod tests {
                     c.compare.fast_window_ms = 249;
                 },
                 Contradiction::CompareWindows,
+            ),
+            (
+                |c| c.meter.switching_current = c.flag.small_full_scale,
+                Contradiction::SwitchingCurrent,
             ),
             (|c| c.edge_storm.events = 21, Contradiction::Storm),
             (

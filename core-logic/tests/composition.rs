@@ -11,8 +11,8 @@
 
 use core_logic::can::BatteryVoltage;
 use core_logic::channel_compare::Outcome;
-use core_logic::configuration::Configuration;
-use core_logic::converter::{ConverterSample, SupplyMode};
+use core_logic::configuration::{Configuration, FIELDS};
+use core_logic::converter::{ConverterSample, DataRate, SupplyMode};
 use core_logic::design_parameters as design;
 use core_logic::diagnosis::{Code, CodeSet};
 use core_logic::front_end::{
@@ -43,6 +43,8 @@ struct Bench {
     measurement: Measurement,
     now: u64,
     next_conversion: u64,
+    /// Between two conversions.
+    period_us: u64,
     next_tick: u64,
     code: i16,
     range: Range,
@@ -75,6 +77,7 @@ impl Bench {
             configuration,
             now: 0,
             next_conversion: PERIOD_US,
+            period_us: PERIOD_US,
             next_tick: 0,
             code: 4_096,
             range: Range::Small,
@@ -124,9 +127,9 @@ impl Bench {
             let history = |bench: &Self| bench.history();
             if self.next_conversion < self.next_tick {
                 self.now = self.next_conversion;
-                self.next_conversion += PERIOD_US;
+                self.next_conversion += self.period_us;
                 let sample = ConverterSample {
-                    started: Instant::from_ticks(self.now - PERIOD_US),
+                    started: Instant::from_ticks(self.now.saturating_sub(self.period_us)),
                     finished: Instant::from_ticks(self.now),
                     configuration: self.configuration.converter.expected_configuration(),
                     code: self.code,
@@ -462,7 +465,7 @@ fn a_supply_sweep_by_orders_gives_the_relations() {
     let mut configuration = with_front_end(FrontEnd::ClosedLoop(ClosedLoop::default()));
     configuration.supply_test_current = Microamps::from_amps(200);
     configuration.converter.supply_mode = SupplyMode::Measured;
-    configuration.converter.data_rate = core_logic::converter::DataRate::Sps8;
+    configuration.converter.data_rate = DataRate::Sps8;
     configuration.key_calibration.enabled = false;
     let mut bench = Bench::new(configuration);
     assert_eq!(
@@ -539,7 +542,7 @@ fn a_swept_sensor_reads_0_a_whatever_its_zero_was_corrected_by_before() {
     let truth = FrontEnd::ClosedLoop(closed_loop());
     let mut configuration = with_front_end(FrontEnd::ClosedLoop(ClosedLoop::default()));
     configuration.supply_test_current = Microamps::from_amps(200);
-    configuration.converter.data_rate = core_logic::converter::DataRate::Sps8;
+    configuration.converter.data_rate = DataRate::Sps8;
     configuration.key_calibration.enabled = false;
     configuration
         .zero_drift
@@ -1974,4 +1977,23 @@ fn missing_messages_and_the_key_without_samples_are_reported() {
     bench.run_ms(2_500);
     assert!(bench.has(Code::HvWithoutPermit));
     assert!(bench.readings().high_voltage_on);
+}
+
+/// What the comparators never reach while the small sensor still follows would leave it at its end for good.
+#[test]
+fn a_switching_current_beyond_the_small_sensor_is_refused() {
+    let put = |amps: i64, front_end: i64| {
+        let mut configuration = Configuration::default();
+        for (address, value) in [(0x0100, front_end), (0x050E, amps * 1_000_000)] {
+            let field = FIELDS.iter().find(|field| field.layout.address == address);
+            field.unwrap().put(&mut configuration, 0, value).unwrap();
+        }
+        configuration.validate()
+    };
+    assert_eq!(put(59, 0), Ok(()));
+    for amps in [60, 61, 500] {
+        assert!(put(amps, 0).is_err(), "{amps} A");
+        // With one sensor it says nothing.
+        assert_eq!(put(amps, 1), Ok(()));
+    }
 }

@@ -411,7 +411,7 @@ fields! {
     0x0508 I32 1 Standstill (-50_000, 50_000) "meter: reference error" "ppm" "of the reference voltage, measured less nominal" [at meter.reference_error];
     0x050A I32 1 Standstill (-50_000, 50_000) "meter: divider error" "ppm" "of the ratio that makes 0.1 V for channel 2" [at meter.divider_error];
     0x050C I32 1 Always (0, 1_000) "meter: no-load threshold" "ppm" "share of the full scale" [at meter.no_load];
-    0x050E I32 1 Standstill (FULL_SCALE.0, FULL_SCALE.1) "switching current" "µA" "at which the comparators switch" [at meter.switching_current];
+    0x050E I32 1 Standstill (FULL_SCALE.0, FULL_SCALE.1) "switching current" "µA" "at which the comparators switch; of two sensors below the small one's full scale" [at meter.switching_current];
     0x0510 I32 1 Standstill (0, 100_000_000) "switching tolerance" "µA" "of the switching current" [at meter.switching_tolerance];
     0x0512 U32 1 Standstill (0, 10_000_000) "meter: slew limit" "A/s" "fastest change of the current that estimates allow for" [at meter.slew_limit_amps_per_second];
     0x0514 U32 1 Standstill (0, 80_000) "meter: short interval" "µs" "intervals with chatter up to this wait for the next reading, which the meter is not stale by: 100 ms" [at meter.short_interval_us];
