@@ -440,15 +440,14 @@ impl FrontEnd {
     /// D3 is the same with the network's output as the signal: its bipolar Hall output cannot pass the 5 V switch.
     #[must_use]
     pub const fn meter_full_scale(&self, range: Range) -> Microamps {
-        let (numerator, denominator) = design::CHANNEL_1_SCALE;
-        let signal_nanovolts = mul_div(
+        const SIGNAL_NANOVOLTS: i64 = mul_div(
             design::METER_FULL_SCALE_INPUT.get() as i64 * 1_000,
-            denominator,
-            numerator,
+            design::CHANNEL_1_SCALE.1,
+            design::CHANNEL_1_SCALE.0,
         );
         let line = self.line(range, design::SENSOR_NOMINAL_SUPPLY);
         Microamps(clamp_i32(mul_div(
-            signal_nanovolts,
+            SIGNAL_NANOVOLTS,
             line.numerator,
             line.denominator,
         )))

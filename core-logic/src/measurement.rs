@@ -457,6 +457,11 @@ pub fn prepare(configuration: &Configuration, basis: &Basis) -> Prepared {
         gain: configuration.current_gain,
         zero_drift: configuration.zero_drift.value,
     };
+    // A larger sensor's meter leaves more uncounted than the setting's 3 mA of D0.
+    let mut soc = configuration.soc;
+    soc.no_load_threshold = soc
+        .no_load_threshold
+        .max(configuration.meter.no_load_current(Range::Small));
     Prepared {
         converter: ConverterCoefficients::prepare(
             &configuration.converter,
@@ -469,7 +474,7 @@ pub fn prepare(configuration: &Configuration, basis: &Basis) -> Prepared {
             &configuration.front_end,
             supply,
         ),
-        soc: SocCoefficients::new(&configuration.soc),
+        soc: SocCoefficients::new(&soc),
         supply,
     }
 }

@@ -86,7 +86,8 @@ pub struct SocConfig {
     pub ocv_uncertainty: Microvolts,
     /// Half-width of the current offset that is left after the zero-drift compensation.
     pub offset_uncertainty: Microamps,
-    /// Currents up to this may flow without a count (no-load threshold of the ADE7753).
+    /// Currents up to this may flow without a count (no-load threshold of the ADE7753). What the meter's configuration makes of the
+    /// sensor's full scale is taken where it is more.
     pub no_load_threshold: Microamps,
     /// Half-width of the gain of the current measurement.
     pub gain_uncertainty: Ppm,

@@ -1997,3 +1997,21 @@ fn a_switching_current_beyond_the_small_sensor_is_refused() {
         assert_eq!(put(amps, 1), Ok(()));
     }
 }
+
+/// By the meter's full scale of 562.5 A 28 mA may flow at rest without a count, of which 0x0712 of the factory says 3.
+#[test]
+fn what_a_single_sensor_may_leave_uncounted_is_doubted() {
+    let uncertainty = |front_end| {
+        let mut configuration = with_front_end(front_end);
+        configuration.soc.capacity_mah = 1_000;
+        let mut bench = Bench::new(configuration);
+        bench.measurement.set_state_of_charge(Ppm(500_000), Ppm(0));
+        bench.run_ms(600_000);
+        bench.readings().soc_uncertainty.get()
+    };
+    // Beside the offset's 20 mA, of 3,600 C: 23 and 48.1 mA over 600 s.
+    let d0 = uncertainty(FrontEnd::default());
+    assert!((3_800..3_860).contains(&d0), "{d0} ppm");
+    let d2 = uncertainty(FrontEnd::Hah1bv(Hah1bv::default()));
+    assert!((7_980..8_050).contains(&d2), "{d2} ppm");
+}

@@ -448,7 +448,7 @@ fields! {
     0x070C U32 1 Always (10, 60_000) "cell voltage age" "ms" "oldest cell voltage that is used" [at soc.cell_voltage_max_age_ms];
     0x070E I32 1 Always (100, 100_000) "open-circuit uncertainty" "µV" "half-width: table, hysteresis, relaxation, measurement" [at soc.ocv_uncertainty];
     0x0710 I32 1 Always (0, 10_000_000) "offset uncertainty" "µA" "half-width of the offset that is left" [at soc.offset_uncertainty];
-    0x0712 I32 1 Always (0, 10_000_000) "no-load threshold" "µA" "currents up to this may flow without a count" [at soc.no_load_threshold];
+    0x0712 I32 1 Always (0, 10_000_000) "no-load threshold" "µA" "currents up to this may flow without a count; at least the meter's own of the small or only sensor is reckoned with" [at soc.no_load_threshold];
     0x0714 I32 1 Always (0, 100_000) "gain uncertainty" "ppm" "half-width of the gain of the current" [at soc.gain_uncertainty];
     0x0716 I32 1 Always (0, 500_000) "capacity uncertainty" "ppm" "half-width of the capacity" [at soc.capacity_uncertainty];
     0x0718 U32 1 Always (1, 10_000) "presented slew" "ppm/s" "rate at which the presented state of charge follows an anchoring" [at soc.presented_slew_ppm_per_s];
