@@ -23,7 +23,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::converter::{ConverterConfigError, Gain};
 use crate::design_parameters::{TEMPERATURE_HIGH, TEMPERATURE_LOW};
-use crate::front_end::PerRange;
+use crate::front_end::{KeyFactors, PerRange};
 use crate::range::Range;
 use crate::storm::StormConfig;
 use crate::units::{Microamps, MilliCelsius, Ppm, milliseconds};
@@ -265,6 +265,13 @@ impl Configuration {
         self.meter.full_scale = full_scale;
         self.flag.switching_current = switching_current;
         self.flag.small_full_scale = small_full_scale;
+    }
+
+    /// What was found of another sensor's zero, or of one that is known otherwise now, would be taken off once more.
+    #[inline(never)]
+    pub fn forget_zero(&mut self) {
+        self.zero_drift.value = PerRange::both(Microamps::ZERO);
+        self.key_factors = KeyFactors::NONE;
     }
 
     fn contradiction(&self) -> Option<Contradiction> {

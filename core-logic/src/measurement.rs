@@ -114,9 +114,8 @@ impl Found {
             Self::SupplyRelations(relations) => {
                 if let FrontEnd::ClosedLoop(sensor) = &mut configuration.front_end {
                     sensor.relations = relations;
-                    // They hold all of its zero: what was taken off it before would be taken off twice.
-                    configuration.zero_drift.value = PerRange::both(Microamps::ZERO);
-                    configuration.key_factors = KeyFactors::NONE;
+                    // They hold all of its zero.
+                    configuration.forget_zero();
                 }
             }
         }

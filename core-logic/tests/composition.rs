@@ -2015,3 +2015,22 @@ fn what_a_single_sensor_may_leave_uncounted_is_doubted() {
     let d2 = uncertainty(FrontEnd::Hah1bv(Hah1bv::default()));
     assert!((7_980..8_050).contains(&d2), "{d2} ppm");
 }
+
+/// They are of the sensor that was there.
+#[test]
+fn another_front_end_comes_without_zero_drift_and_key_factors() {
+    let mut configuration = Configuration::default();
+    let value = PerRange {
+        small: Microamps(800_000),
+        large: Microamps(-3_000_000),
+    };
+    configuration.zero_drift.value = value;
+    configuration.key_factors.a = Microvolts(10_000);
+    let before = configuration;
+    let front_end = FIELDS.iter().find(|field| field.layout.address == 0x0100);
+    front_end.unwrap().put(&mut configuration, 0, 0).unwrap();
+    assert_eq!(configuration, before);
+    front_end.unwrap().put(&mut configuration, 0, 1).unwrap();
+    let found = (configuration.zero_drift.value, configuration.key_factors);
+    assert_eq!(found, (PerRange::both(Microamps::ZERO), KeyFactors::NONE));
+}
