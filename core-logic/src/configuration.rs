@@ -62,6 +62,8 @@ pub enum Contradiction {
     KeyCalibrationDelay,
     /// The slow window of the channels' comparison is not longer than the fast one, or that is shorter than two conversions.
     CompareWindows,
+    /// The average's gap is shorter than two conversions: between two of them the average would be empty.
+    AverageGap,
     /// The comparators would switch where the small sensor of two is at the end of its range, or beyond.
     SwitchingCurrent,
     /// A storm's window or hold-off is too short for its events.
@@ -289,10 +291,11 @@ impl Configuration {
         } else if !self.key_calibration_has_time() {
             Some(Contradiction::KeyCalibrationDelay)
         } else if self.compare.fast_window_ms >= self.compare.slow_window_ms
-            || milliseconds(self.compare.fast_window_ms).as_ticks()
-                < 2 * self.converter.period(self.front_end.channel()).as_ticks()
+            || self.is_within_two_conversions(self.compare.fast_window_ms)
         {
             Some(Contradiction::CompareWindows)
+        } else if self.is_within_two_conversions(self.average.max_gap_ms) {
+            Some(Contradiction::AverageGap)
         } else if self.front_end.has_two_ranges()
             && self.meter.switching_current >= self.front_end.full_scale(Range::Small)
         {
@@ -304,6 +307,11 @@ impl Configuration {
         } else {
             self.ocv.validate().err().map(Contradiction::Ocv)
         }
+    }
+
+    const fn is_within_two_conversions(&self, time_ms: u32) -> bool {
+        let period = self.converter.period(self.front_end.channel());
+        milliseconds(time_ms).as_ticks() < 2 * period.as_ticks()
     }
 
     /// Whether settling and a batch of samples end before the key calibration's longest delay.
@@ -914,7 +922,7 @@ mod tests {
     #[test]
     fn each_contradiction_is_found() {
         type Change = fn(&mut Configuration);
-        let cases: [(Change, Contradiction); 13] = [
+        let cases: [(Change, Contradiction); 14] = [
             (
                 |c| c.converter.gain = crate::converter::Gain::X2,
                 Contradiction::Converter(ConverterConfigError::Gain),
@@ -958,6 +966,14 @@ mod tests {
                     c.compare.fast_window_ms = 249;
                 },
                 Contradiction::CompareWindows,
+            ),
+            (
+                |c| {
+                    c.key_calibration.enabled = false;
+                    c.converter.data_rate = crate::converter::DataRate::Sps8;
+                    c.average.max_gap_ms = 249;
+                },
+                Contradiction::AverageGap,
             ),
             (
                 |c| c.meter.switching_current = c.flag.small_full_scale,

@@ -19,7 +19,7 @@ use crate::units::{Duration, Instant, Microamps, elapsed};
 pub const MAX_LENGTH: usize = 64;
 /// Settable lengths.
 pub const LENGTH_LIMITS: (u8, u8) = (1, 64);
-/// Settable gaps in milliseconds.
+/// Settable gaps in milliseconds; no less than two conversions (`configuration::Contradiction::AverageGap`).
 pub const GAP_LIMITS_MS: (u32, u32) = (100, 60_000);
 
 /// Configuration of the average.

@@ -2034,3 +2034,46 @@ fn another_front_end_comes_without_zero_drift_and_key_factors() {
     let found = (configuration.zero_drift.value, configuration.key_factors);
     assert_eq!(found, (PerRange::both(Microamps::ZERO), KeyFactors::NONE));
 }
+
+/// A gap shorter than what lies between two conversions would leave the average without a reading in each of them.
+#[test]
+fn the_averages_gap_is_longer_than_two_conversions() {
+    let judge = |data_rate, max_gap_ms| {
+        let mut configuration = Configuration::default();
+        configuration.key_calibration.enabled = false;
+        configuration.converter.data_rate = data_rate;
+        configuration.average.max_gap_ms = max_gap_ms;
+        configuration.validate()
+    };
+    assert!(judge(DataRate::Sps8, 100).is_err());
+    assert!(judge(DataRate::Sps8, 249).is_err());
+    assert!(judge(DataRate::Sps16, 124).is_err());
+    assert_eq!(judge(DataRate::Sps8, 250), Ok(()));
+    assert_eq!(judge(DataRate::Sps16, 125), Ok(()));
+    assert_eq!(judge(DataRate::Sps32, 100), Ok(()));
+    assert_eq!(judge(DataRate::Sps128, 100), Ok(()));
+}
+
+/// The shortest gap that is accepted, at the slowest rate: valid all the time.
+#[test]
+fn an_average_of_slow_conversions_is_not_stale_between_them() {
+    for max_gap_ms in [100, 249, 250] {
+        let mut configuration = Configuration::default();
+        configuration.key_calibration.enabled = false;
+        configuration.converter.data_rate = DataRate::Sps8;
+        configuration.average.max_gap_ms = max_gap_ms;
+        if configuration.validate().is_err() {
+            continue;
+        }
+        let mut bench = Bench::new(configuration);
+        bench.period_us = 125_000;
+        bench.code = 16_384;
+        bench.run_ms(2_000);
+        let valid = (0..1_000).filter(|_| {
+            bench.run_ms(10);
+            let average = bench.measurement.current_average(&bench.configuration);
+            average.validity.is_valid()
+        });
+        assert_eq!(valid.count(), 1_000, "{max_gap_ms} ms");
+    }
+}

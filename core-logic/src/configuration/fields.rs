@@ -389,7 +389,7 @@ fields! {
     0x030E I32 2 Standstill (1, 50_000_000) "zero drift: meter mean" "µA" "largest mean of the meter at which no current may flow; small, large sensor" [ranges zero_drift.max_meter_mean];
     0x0312 U32 1 Standstill (100, 600_000) "zero drift: timeout" "ms" "longest time that `zero now` takes" [at zero_drift.timeout_ms];
     0x0320 U16 1 Always (sliding_average::LENGTH_LIMITS.0, sliding_average::LENGTH_LIMITS.1) "average: length" "readings" "of the sliding average" [at average.length];
-    0x0322 U32 1 Always (sliding_average::GAP_LIMITS_MS.0, sliding_average::GAP_LIMITS_MS.1) "average: gap" "ms" "without a valid reading after which it starts anew" [at average.max_gap_ms];
+    0x0322 U32 1 Always (sliding_average::GAP_LIMITS_MS.0, sliding_average::GAP_LIMITS_MS.1) "average: gap" "ms" "without a valid reading after which it starts anew; at least two conversions at the data rate" [at average.max_gap_ms];
 
     0x0400 U16 1 Standstill (0, 1) "key calibration: enabled" "" "0 off, 1 on" [at key_calibration.enabled];
     0x0401 U16 1 Standstill (0, 1) "key calibration: on failure" "" "0 permit with the previous factors, 1 hold the permit" [at key_calibration.on_failure];
