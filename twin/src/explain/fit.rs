@@ -23,6 +23,10 @@ const ENOUGH: f64 = 1e-4;
 const WORSE_BY: f64 = 1.05;
 /// Shares of a time at which another minimum is looked for in the end.
 const ELSEWHERE: [f64; 4] = [0.8, 0.9, 1.1, 1.25];
+/// Where between two readings another minimum is looked for, as shares of the time between them.
+const BETWEEN: [f64; 3] = [-0.5, 0.0, 0.5];
+/// The same if a row of the reference is this share of that time at most.
+const FEW: f64 = 0.5;
 /// How far away values without a slope are tried.
 const SHARES: [f64; 8] = [0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5];
 /// So often from where the last of them led.
@@ -269,7 +273,7 @@ pub fn polish(bench: &Workbench<'_>, from: &Fit) -> Fit {
             break;
         }
     }
-    other_minimum(bench, best)
+    other_moment(bench, other_minimum(bench, best))
 }
 
 /// The same, or a better one at other values of its times: a load with a rhythm of its own makes a minimum at each window of so many
@@ -287,15 +291,48 @@ pub fn other_minimum(bench: &Workbench<'_>, from: Fit) -> Fit {
             for share in ELSEWHERE {
                 let mut moved = best.model.clone();
                 moved.members[m].values[p] *= share;
-                let there = fit(bench, &moved, None);
-                let sigma = there.sigma.min(best.sigma);
-                if loss(&there.residual, sigma) < 0.999 * loss(&best.residual, sigma) {
-                    best = there;
-                }
+                best = better(bench, best, &moved);
             }
         }
     }
     best
+}
+
+/// The same, or a better one where readings stand for other moments: where the reference has rows between two readings it may turn
+/// there, and each turn may make a minimum.
+fn other_moment(bench: &Workbench<'_>, from: Fit) -> Fit {
+    let (row_s, reading_s) = (bench.scale.step_s, bench.scale.reading_step_s);
+    let of_sensor = matches!(bench.problem.base, Base::Sensor(_));
+    if !of_sensor || !bench.aligns(&from.model) || row_s > FEW * reading_s {
+        return from;
+    }
+    let mut best = from;
+    for share in BETWEEN {
+        let alignment_s = share * reading_s;
+        if (alignment_s - best.model.nuisance.alignment_s).abs() > row_s {
+            let mut moved = best.model.clone();
+            moved.nuisance.alignment_s = alignment_s;
+            let there = other_minimum(bench, fit(bench, &moved, None));
+            best = lower(best, there);
+        }
+    }
+    best
+}
+
+/// The better one of a fit and that of a model.
+fn better(bench: &Workbench<'_>, best: Fit, model: &Model) -> Fit {
+    let there = fit(bench, model, None);
+    lower(best, there)
+}
+
+/// The second of two fits, if its loss is lower.
+fn lower(best: Fit, there: Fit) -> Fit {
+    let sigma = there.sigma.min(best.sigma);
+    if loss(&there.residual, sigma) < 0.999 * loss(&best.residual, sigma) {
+        there
+    } else {
+        best
+    }
 }
 
 /// Levenberg–Marquardt from a model whose slope may be known; gives the slope where it ends if that is known.
@@ -504,5 +541,100 @@ impl Stepping<'_, '_, '_> {
             }
         }
         found
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::effects::find;
+    use crate::explain::workbench::Member;
+    use crate::problem::{Accuracy, Coloured, Drive, Observed, Problem, SensorBase, View};
+    use rand_chacha::ChaCha8Rng;
+    use rand_chacha::rand_core::SeedableRng as _;
+    use rand_distr::{Distribution as _, StandardNormal};
+
+    const ROW_S: f64 = 0.005;
+    /// Rows from one reading to the next.
+    const READ: usize = 20;
+    const ROWS: usize = 2400;
+    const NOISE_W: f64 = 0.3;
+
+    /// A load that is on for half of each tenth of a second, in groups with a rest between them.
+    fn power_w(row: usize) -> f64 {
+        let turn = (row / 400) as f64;
+        let since_s = (row % 400) as f64 * ROW_S;
+        let group_s = 0.1 * (9.0 + 4.0 * (2.3 * turn).sin());
+        let in_group = (0.35..0.35 + group_s).contains(&since_s);
+        let more_w = if in_group && row % READ < READ / 2 {
+            200.0 + 60.0 * (1.7 * turn).cos()
+        } else {
+            0.0
+        };
+        100.0 + more_w
+    }
+
+    /// What a sensor reads of it ten times a second that shows the mean over a window.
+    fn problem(window_s: f64) -> Problem {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let t_s: Vec<f64> = (0..ROWS).map(|row| row as f64 * ROW_S).collect();
+        let mut problem = Problem {
+            view: View::Sensor,
+            name: "p_meas_w".into(),
+            unit: "W".into(),
+            drive: Drive {
+                t_s: t_s.clone().into(),
+                reference: (0..ROWS).map(power_w).collect(),
+                segments: std::iter::once(0..ROWS).collect(),
+                continues: vec![false],
+                ..Drive::default()
+            },
+            observed: Observed::with_drive(t_s, vec![0.0; ROWS]),
+            base: Base::Sensor(SensorBase::default()),
+            modelled: Vec::new(),
+            noise: 0.0,
+            coloured: Coloured::default(),
+            accuracy: Accuracy::default(),
+        };
+        let shown = crate::explain::predict(&problem, &[("moving-average".into(), vec![window_s])]);
+        problem.observed.value = shown
+            .iter()
+            .map(|w| {
+                let noise: f64 = StandardNormal.sample(&mut random);
+                w + NOISE_W * noise
+            })
+            .collect();
+        problem.observed.valid = (0..ROWS).map(|row| row % READ == READ / 4).collect();
+        problem
+    }
+
+    #[test]
+    fn a_rhythm_in_the_load_hides_a_window_behind_no_other_moment() {
+        const WINDOW_S: f64 = 0.8;
+        let problem = problem(WINDOW_S);
+        let bench = Workbench::new(&problem, &[]);
+        let window = |fit: &Fit| fit.model.members[0].values[0];
+        let mut elsewhere = 0;
+        for (share, alignment_s) in [(1.1, 0.05), (1.1, -0.05), (0.9, 0.05), (0.9, -0.05)] {
+            let mut model = Model::default().with(Member {
+                effect: find("moving-average").unwrap(),
+                values: vec![share * WINDOW_S],
+            });
+            model.nuisance.alignment_s = alignment_s;
+            let near = other_minimum(&bench, fit(&bench, &model, None));
+            elsewhere += usize::from((window(&near) - WINDOW_S).abs() > 0.02);
+            let found = polish(&bench, &near);
+            assert!(
+                (window(&found) - WINDOW_S).abs() < 0.005,
+                "{share} {alignment_s}: {} {}, before {} {}",
+                window(&found),
+                found.model.nuisance.alignment_s,
+                window(&near),
+                near.model.nuisance.alignment_s
+            );
+        }
+        // Or the drive tests nothing.
+        assert!(elsewhere >= 2, "{elsewhere}");
     }
 }
