@@ -5,7 +5,7 @@
 //! them, with [`slope`]s, [`normal`] equations and a [`robust`] loss, and with what the model file leaves open (`starts`);
 //! [`held_out`] says what a fit is worth on rows that it was not made of, and [`select`] decides. [`intervals`] and [`locate`] say how
 //! sure and where; `trust`, [`shape`] and `unfitted` take back names that the recording or other files do not bear out, `strays`
-//! looks at readings that no noise makes, `verdict` says what that makes (`quieter`: whether what works between the rows only evens
+//! looks at readings that no noise makes, `dropout` at stretches that no physics makes, `verdict` says what that makes (`quieter`: whether what works between the rows only evens
 //! out noise of the reference), `elsewhere` whether another start would do the same, and `told` puts the report together.
 //! Nothing here knows a file or an effect by name.
 
@@ -13,6 +13,7 @@ mod apart;
 mod beyond;
 mod censored;
 mod course;
+mod dropout;
 mod elsewhere;
 pub mod fit;
 pub mod flexible;
@@ -177,7 +178,36 @@ fn gained(one: &Fit, other: &Fit) -> f64 {
     robust::loss(&one.residual, sigma) - robust::loss(&other.residual, sigma)
 }
 
-/// One signal. Where its ends turn out to depend on what the reference did outside the recording, it is decided again without them.
+/// What was decided about a signal, on which part of it.
+struct Settled<'a> {
+    course: Course<'a>,
+    answer: Answer,
+    /// How far, in s, the ends are left out, if they are.
+    ends_s: Option<[f64; 2]>,
+}
+
+impl<'a> Settled<'a> {
+    /// Where the ends turn out to depend on what the reference did outside the recording, it is decided again without them.
+    fn of(mut course: Course<'a>, options: &Options, progress: &mut dyn FnMut(f64, &str)) -> Self {
+        let mut ends_s = None;
+        let mut answer = course.answered(options, progress);
+        for _ in 0..LEAD_INS {
+            let Some(reach_s) = answer.reach_s(&course, options) else {
+                break;
+            };
+            course = course.without_ends(reach_s);
+            answer = course.answered(options, progress);
+            ends_s = Some(reach_s);
+        }
+        Self {
+            course,
+            answer,
+            ends_s,
+        }
+    }
+}
+
+/// One signal. Where stretches of the log are in the way of an answer, it is decided again without them.
 fn one(
     problem: &Problem,
     holdouts: &[Holdout],
@@ -185,36 +215,57 @@ fn one(
     report: &mut Report,
     progress: &mut dyn FnMut(f64, &str),
 ) -> Part {
-    let mut course = Course::new(problem, holdouts);
-    let mut left_out = None;
-    let mut answer = course.answered(options, progress);
-    for _ in 0..LEAD_INS {
-        let Some(reach_s) = answer.reach_s(&course, options) else {
-            break;
-        };
-        course = course.without_ends(reach_s);
-        answer = course.answered(options, progress);
-        left_out = Some(reach_s);
+    let mut settled = Settled::of(Course::new(problem, holdouts), options, progress);
+    let mut dropouts = settled.answer.dropouts(&settled.course, options);
+    if !dropouts.is_empty() {
+        let course = Course::new(problem, holdouts).without_dropouts(&dropouts);
+        let again = Settled::of(course, options, progress);
+        if again.answer.decided.says_more_than(&settled.answer.decided) {
+            settled = again;
+        } else {
+            dropouts.clear();
+        }
     }
+    let Settled {
+        course,
+        answer,
+        ends_s,
+    } = settled;
     let Answer {
         other,
         decided,
         shown,
         between,
     } = answer;
-    let part = tell(
+    let model = decided.selection.fit.model.clone();
+    let places = report.locations.len();
+    let mut part = tell(
         other.as_ref().unwrap_or(&course),
         (decided, &shown),
         between,
         options,
         report,
     );
+    if !dropouts.is_empty() {
+        let whole = Workbench::new(problem, &options.without);
+        let of_rest = (part.verdict != Verdict::NoMismatch).then_some(part.sentence.as_str());
+        let told = dropout::told(&whole, &model, &dropouts, of_rest);
+        report.locations.splice(places..places, told.locations);
+        report.unexplained.push(told.unexplained);
+        part.verdict = dropout::verdict(part.verdict);
+        part.sentence = told.sentence;
+        part.selection.decisions.push(format!(
+            "Decided again without {} readings that no effect makes, of {} in all: more is accounted for.",
+            whole.len() - report.signals.last().map_or(0, |signal| signal.samples),
+            whole.len(),
+        ));
+    }
     // What made them so may have been taken back since.
     let is_named = report
         .effects
         .iter()
         .any(|effect| effect.signal == problem.name);
-    let said = left_out.map(|reach_s| lead_in::told(&problem.name, reach_s, is_named));
+    let said = ends_s.map(|reach_s| lead_in::told(&problem.name, reach_s, is_named));
     report.remarks.extend(said);
     part
 }
@@ -305,6 +356,8 @@ fn tell(
         .extend(not_told(bench, &selection, &reported));
     report.remarks.extend(behind_ends(&read));
     report.remarks.extend(overstated(bench, &selection.plain));
+    let dropouts = others.iter().filter_map(|other| other.dropouts(model));
+    report.remarks.extend(dropouts);
     report
         .remarks
         .extend(others.iter().filter_map(|other| other.beyond(model)));
@@ -370,6 +423,19 @@ impl Decided {
         let mut ids: Vec<_> = named.map(|named| members[named.index].id()).collect();
         ids.sort_unstable();
         ids
+    }
+
+    /// Whether it accounts for more of what it was asked of than another answer does.
+    fn says_more_than(&self, other: &Self) -> bool {
+        let rank = |decided: &Self| match decided.verdict {
+            Verdict::Unknown => 0,
+            Verdict::PartlyExplained => 1,
+            _ if decided.doubted => 1,
+            _ => 2,
+        };
+        // That nothing is missing is no answer where something was named.
+        let takes_back = self.names_nothing() && !other.names_nothing();
+        rank(self) > rank(other) && !takes_back
     }
 
     /// The bench that it was decided on.

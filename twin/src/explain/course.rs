@@ -2,13 +2,14 @@
 
 use std::borrow::Cow;
 
+use super::dropout::{self, Dropout};
 use super::fit::{self, Fit};
 use super::slope;
 use super::unfitted::Unfitted;
 use super::workbench::{Member, Model, Workbench};
 use super::{Decided, Holdout, Options, decide, gained, lead_in, rms};
 use crate::effects::Search;
-use crate::problem::{Holds, Problem};
+use crate::problem::{Holds, Problem, View};
 use crate::report::data::Verdict;
 
 /// The reference goes smoothly from row to row, or stays, if that makes the loss smaller by this (odds of e¹⁰, for no value more); where its
@@ -140,6 +141,24 @@ impl Answer {
             return lead_in::missed(&bench, &course.nearest(options)?);
         }
         lead_in::missed(&bench, &self.shown)
+    }
+
+    /// Stretches of the log that no physics makes, where they may be in the way of this answer.
+    pub(super) fn dropouts(&self, straight: &Course<'_>, options: &Options) -> Vec<Dropout> {
+        let decided = &self.decided;
+        if !(decided.doubted
+            || matches!(decided.verdict, Verdict::Unknown | Verdict::PartlyExplained))
+        {
+            return Vec::new();
+        }
+        let course = self.other.as_ref().unwrap_or(straight);
+        let bench = Workbench::new(&course.problem, &options.without);
+        // Where nothing is named, what is nearest to a name is not to hide them.
+        let nearest = (decided.names_nothing() && course.problem.view == View::Sensor)
+            .then(|| course.nearest(options))
+            .flatten();
+        let fit = dropout::without_far(&bench, nearest.as_ref().unwrap_or(&self.shown));
+        dropout::found(&bench, &fit.residual)
     }
 }
 
@@ -335,6 +354,11 @@ impl Course<'_> {
                 other.clone()
             }
         })
+    }
+
+    /// The same without the readings of some stretches ([`dropout`]).
+    pub(super) fn without_dropouts(&self, dropouts: &[Dropout]) -> Course<'static> {
+        self.with(dropout::without(&self.problem, dropouts), Problem::clone)
     }
 
     /// What is decided about it, and what that leaves of the readings.

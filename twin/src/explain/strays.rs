@@ -24,7 +24,7 @@ const STRAYS: usize = 2;
 /// Those readings are the mismatch if they make this share of its energy.
 const STRAYED: f64 = 0.5;
 /// So many in a row, all to one side, are the mismatch however little they make of it: something was there for a while.
-const IN_A_ROW: usize = 3;
+pub(super) const IN_A_ROW: usize = 3;
 /// Where no noise is stated, a heavy tail is a noise of its own: there they have to be nearly all of it.
 const NEARLY_ALL: f64 = 0.9;
 

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use super::beyond::beyond_known;
+use super::dropout;
 use super::fit;
 use super::normal::dot;
 use super::starts::begun;
@@ -72,6 +73,12 @@ impl<'a> Unfitted<'a> {
                 short(left / problem.noise)
             )
         })
+    }
+
+    /// Stretches of it that no physics makes, in what a model leaves.
+    pub(super) fn dropouts(&self, model: &Model) -> Option<String> {
+        let said = dropout::of_unfitted(&self.bench, &self.left_by(model))?;
+        Some(format!("{}: {said}", self.file.display()))
     }
 
     /// What is taken of its resistances, where it is colder or warmer than what was fitted.

@@ -143,11 +143,12 @@ pub struct Location {
     pub from: Option<f64>,
     /// Upper end; `None`: open.
     pub to: Option<f64>,
-    /// Share of the mismatch's energy, 0 … 1.
+    /// Share of the mismatch's energy, 0 … 1. Where stretches were left out, theirs are of all of it, the others' of the rest.
     pub energy_share: f64,
     /// Share of the samples, 0 … 1.
     pub sample_share: f64,
-    /// From block permutation.
+    /// From block permutation; of a stretch that was left out, how often so many readings far off would follow one another, at the most,
+    /// if they were anywhere.
     pub p_value: f64,
     /// The named effect that accounts for it, if one does.
     pub effect: Option<String>,

@@ -124,7 +124,7 @@ pub fn p_value(p: f64) -> String {
 }
 
 /// The ends of a stretch, with four digits; to a hundredth of it where four are coarser: of times since 1970 they are all the same.
-fn ends(from: f64, to: f64) -> [String; 2] {
+pub(crate) fn ends(from: f64, to: f64) -> [String; 2] {
     let power_of_ten = |value: f64| value.log10().floor() as i32;
     let (stretch, size) = (to - from, from.abs().max(to.abs()));
     if !(stretch > 0.0 && 10f64.powi(power_of_ten(size) - 3) > 0.01 * stretch) {

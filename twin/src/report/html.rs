@@ -259,7 +259,7 @@ fn places(page: &mut String, report: &Report) {
         return;
     }
     page.push_str(
-        "<p>Places that hold more of the mismatch's energy than of the samples. p is how often chance makes a place as telling: of time with the recording's blocks in any order, of a region with the recording moved against it, of a band of frequency with the noise that the model file states, or the readings in any order.</p>\n\
+        "<p>Places that hold more of the mismatch's energy than of the samples. p is how often chance makes a place as telling: of time with the recording's blocks in any order, of a region with the recording moved against it, of a band of frequency with the noise that the model file states, or the readings in any order; of a stretch that was left out, with its readings anywhere.</p>\n\
          <table class=\"stack\">\n<thead><tr><th scope=\"col\">Place</th><th scope=\"col\">Signal</th><th scope=\"col\">Energy</th><th scope=\"col\">Samples</th>\
          <th scope=\"col\" class=\"n\">Density</th><th scope=\"col\">p</th><th scope=\"col\">Accounted for by</th></tr></thead>\n<tbody>\n",
     );
