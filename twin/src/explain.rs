@@ -256,7 +256,7 @@ fn one(
         part.sentence = told.sentence;
         part.selection.decisions.push(format!(
             "Decided again without {} readings that no effect makes, of {} in all: more is accounted for.",
-            whole.len() - report.signals.last().map_or(0, |signal| signal.samples),
+            dropout::count(&dropouts),
             whole.len(),
         ));
     }
@@ -283,6 +283,7 @@ fn tell(
     let white = read.whitened();
     let bench = decided.bench(&read, white.as_ref());
     let others = Unfitted::all(&course.holdouts, &problem.name);
+    let leaves_something = decided.leaves_something();
     let Decided {
         mut selection,
         verdict,
@@ -331,7 +332,7 @@ fn tell(
     report
         .holdouts
         .extend(others.iter().map(|other| other.report(model)));
-    if doubted || matches!(verdict, Verdict::Unknown | Verdict::PartlyExplained) {
+    if leaves_something {
         let place = locate::locate(&read, &shown.residual, options.seed)
             .into_iter()
             .next();
@@ -425,13 +426,15 @@ impl Decided {
         ids
     }
 
+    /// Whether something is left that it does not account for, or not for sure.
+    fn leaves_something(&self) -> bool {
+        self.doubted || matches!(self.verdict, Verdict::Unknown | Verdict::PartlyExplained)
+    }
+
     /// Whether it accounts for more of what it was asked of than another answer does.
     fn says_more_than(&self, other: &Self) -> bool {
-        let rank = |decided: &Self| match decided.verdict {
-            Verdict::Unknown => 0,
-            Verdict::PartlyExplained => 1,
-            _ if decided.doubted => 1,
-            _ => 2,
+        let rank = |decided: &Self| {
+            u8::from(decided.verdict != Verdict::Unknown) + u8::from(!decided.leaves_something())
         };
         // That nothing is missing is no answer where something was named.
         let takes_back = self.names_nothing() && !other.names_nothing();

@@ -476,6 +476,14 @@ impl Problem {
         self
     }
 
+    /// The same, of which the readings of some rows of the observation do not count.
+    pub(crate) fn without_readings(&self, rows: impl IntoIterator<Item = usize>) -> Self {
+        let mut other = self.clone();
+        rows.into_iter()
+            .for_each(|row| other.observed.valid[row] = false);
+        other
+    }
+
     /// A sensor beside its reference in one stretch, both in A and read in the same rows, with white noise of an rms.
     #[cfg(test)]
     pub(crate) fn pair(t_s: Vec<f64>, reference: Vec<f64>, reading: Vec<f64>, noise: f64) -> Self {

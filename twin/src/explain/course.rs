@@ -146,9 +146,7 @@ impl Answer {
     /// Stretches of the log that no physics makes, where they may be in the way of this answer.
     pub(super) fn dropouts(&self, straight: &Course<'_>, options: &Options) -> Vec<Dropout> {
         let decided = &self.decided;
-        if !(decided.doubted
-            || matches!(decided.verdict, Verdict::Unknown | Verdict::PartlyExplained))
-        {
+        if !decided.leaves_something() {
             return Vec::new();
         }
         let course = self.other.as_ref().unwrap_or(straight);

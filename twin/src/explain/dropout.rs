@@ -12,7 +12,7 @@ use super::robust::common;
 use super::strays::{IN_A_ROW, RARE, STRAY};
 use super::told::short;
 use super::workbench::{Model, Workbench};
-use crate::problem::{Observed, Problem, View};
+use crate::problem::{Problem, View};
 use crate::report::data::{Location, LocationKind, Unexplained, Verdict};
 use crate::report::format::ends;
 
@@ -261,18 +261,15 @@ fn told_of(bench: &Workbench<'_>, run: &Range<usize>) -> Dropout {
 
 /// A problem without the readings of some stretches.
 pub(super) fn without(problem: &Problem, dropouts: &[Dropout]) -> Problem {
-    let mut valid = problem.observed.valid.clone();
-    for dropout in dropouts {
+    problem.without_readings(dropouts.iter().flat_map(|dropout| {
         let [first, last] = dropout.rows;
-        valid[first..=last].fill(false);
-    }
-    Problem {
-        observed: Observed {
-            valid,
-            ..problem.observed.clone()
-        },
-        ..problem.clone()
-    }
+        first..=last
+    }))
+}
+
+/// How many readings that are.
+pub(super) fn count(dropouts: &[Dropout]) -> usize {
+    dropouts.iter().map(|dropout| dropout.count).sum()
 }
 
 /// The verdict on a signal of which the rest has one: what was left out is not accounted for.
@@ -361,7 +358,6 @@ pub(super) fn told(
 
 /// How many readings, and where.
 fn readings(dropouts: &[Dropout]) -> String {
-    let count: usize = dropouts.iter().map(|dropout| dropout.count).sum();
     let (named, others) = dropouts.split_at(dropouts.len().min(PLACES));
     let mut places = named
         .iter()
@@ -373,7 +369,7 @@ fn readings(dropouts: &[Dropout]) -> String {
         1 => places.push_str(" and in one more stretch"),
         more => places.push_str(&format!(" and in {more} more stretches")),
     }
-    format!("{count} readings {places}")
+    format!("{} readings {places}", count(dropouts))
 }
 
 /// What is to be said of such stretches in a file that was never fitted, of which a model leaves so much: they are not left out there.

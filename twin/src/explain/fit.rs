@@ -23,6 +23,8 @@ const ENOUGH: f64 = 1e-4;
 const WORSE_BY: f64 = 1.05;
 /// Shares of a time at which another minimum is looked for in the end.
 const ELSEWHERE: [f64; 4] = [0.8, 0.9, 1.1, 1.25];
+/// Another minimum is taken if its loss is below this share.
+const LOWER: f64 = 0.999;
 /// Where between two readings another minimum is looked for, as shares of the time between them.
 const BETWEEN: [f64; 3] = [-0.5, 0.0, 0.5];
 /// The same if a row of the reference is this share of that time at most.
@@ -291,7 +293,7 @@ pub fn other_minimum(bench: &Workbench<'_>, from: Fit) -> Fit {
             for share in ELSEWHERE {
                 let mut moved = best.model.clone();
                 moved.members[m].values[p] *= share;
-                best = better(bench, best, &moved);
+                best = lower(best, fit(bench, &moved, None));
             }
         }
     }
@@ -319,16 +321,10 @@ fn other_moment(bench: &Workbench<'_>, from: Fit) -> Fit {
     best
 }
 
-/// The better one of a fit and that of a model.
-fn better(bench: &Workbench<'_>, best: Fit, model: &Model) -> Fit {
-    let there = fit(bench, model, None);
-    lower(best, there)
-}
-
 /// The second of two fits, if its loss is lower.
 fn lower(best: Fit, there: Fit) -> Fit {
     let sigma = there.sigma.min(best.sigma);
-    if loss(&there.residual, sigma) < 0.999 * loss(&best.residual, sigma) {
+    if loss(&there.residual, sigma) < LOWER * loss(&best.residual, sigma) {
         there
     } else {
         best
@@ -550,7 +546,7 @@ mod tests {
     use super::*;
     use crate::effects::find;
     use crate::explain::workbench::Member;
-    use crate::problem::{Accuracy, Coloured, Drive, Observed, Problem, SensorBase, View};
+    use crate::problem::Problem;
     use rand_chacha::ChaCha8Rng;
     use rand_chacha::rand_core::SeedableRng as _;
     use rand_distr::{Distribution as _, StandardNormal};
@@ -579,24 +575,8 @@ mod tests {
     fn problem(window_s: f64) -> Problem {
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let t_s: Vec<f64> = (0..ROWS).map(|row| row as f64 * ROW_S).collect();
-        let mut problem = Problem {
-            view: View::Sensor,
-            name: "p_meas_w".into(),
-            unit: "W".into(),
-            drive: Drive {
-                t_s: t_s.clone().into(),
-                reference: (0..ROWS).map(power_w).collect(),
-                segments: std::iter::once(0..ROWS).collect(),
-                continues: vec![false],
-                ..Drive::default()
-            },
-            observed: Observed::with_drive(t_s, vec![0.0; ROWS]),
-            base: Base::Sensor(SensorBase::default()),
-            modelled: Vec::new(),
-            noise: 0.0,
-            coloured: Coloured::default(),
-            accuracy: Accuracy::default(),
-        };
+        let power = (0..ROWS).map(power_w).collect();
+        let mut problem = Problem::pair(t_s, power, vec![0.0; ROWS], 0.0);
         let shown = crate::explain::predict(&problem, &[("moving-average".into(), vec![window_s])]);
         problem.observed.value = shown
             .iter()

@@ -5,7 +5,7 @@ use super::fit::Fit;
 use super::select::CERTAIN;
 use super::told::short;
 use super::workbench::{Model, Workbench};
-use crate::problem::{Observed, Problem, View};
+use crate::problem::{Problem, View};
 
 /// No more than this share of the readings is left out: with more, too little of the recording would be judged.
 const MOST: f64 = 0.1;
@@ -62,16 +62,7 @@ pub(super) fn missed(bench: &Workbench<'_>, shown: &Fit) -> Option<[f64; 2]> {
 
 /// A problem whose readings that reach so far out of their stretch do not count.
 pub(super) fn without(problem: &Problem, reach_s: [f64; 2]) -> Problem {
-    let reaching = reaching_out(problem, reach_s);
-    let mut valid = problem.observed.valid.clone();
-    reaching.into_iter().for_each(|row| valid[row] = false);
-    Problem {
-        observed: Observed {
-            valid,
-            ..problem.observed.clone()
-        },
-        ..problem.clone()
-    }
+    problem.without_readings(reaching_out(problem, reach_s))
 }
 
 /// What is said of it; whether anything is named in the end.
