@@ -4,6 +4,7 @@ mod alone;
 mod board;
 mod bounds;
 mod case;
+mod forms;
 mod make;
 mod methods;
 mod pages;

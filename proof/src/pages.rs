@@ -8,7 +8,8 @@ use crate::{
     score::{Outcome, PLAIN},
     stats::Share,
     summary::{
-        Confusion, Counts, DETECTED, Detection, MethodLine, RealLine, Summary, kind_title, shown,
+        Confusion, Counts, DETECTED, Detection, FormLine, MethodLine, RealLine, Summary,
+        kind_title, shown,
     },
     tool::Named,
 };
@@ -275,6 +276,8 @@ fn index(summary: &Summary, folder: &Path) -> String {
     }
     text.push('\n');
 
+    forms_table(&mut text, &summary.forms);
+
     if !summary.methods.is_empty() {
         text.push_str("## Beside what people use today\n\nThe same files, the same held-out data, judged by the same rule; twin on all of these cases, PyBOP on the batteries among them. A straight line names a sensor's gain and \
             offset: nothing of a battery. What failed counts as not right. \
@@ -436,6 +439,19 @@ fn in_short(text: &mut String, summary: &Summary) {
             short(&line.confidently_wrong)
         );
     }
+    let with_form = |line: &&FormLine| !line.right.is_empty();
+    let (cases, told) = (summary.forms.iter().filter(with_form))
+        .fold((0, 0), |(cases, told), line| {
+            (cases + line.cases, told + line.told)
+        });
+    let another: usize = summary.forms.iter().map(|line| line.another).sum();
+    if cases > 0 {
+        let _ = writeln!(
+            text,
+            "- Of these, what is left has a true simple form in {cases} cases: told in {told}. Another is told in {another} of {}.",
+            summary.forms.iter().map(|line| line.cases).sum::<usize>()
+        );
+    }
     if let Some(target) = summary
         .targets
         .iter()
@@ -462,6 +478,37 @@ fn in_short(text: &mut String, summary: &Summary) {
              to at most {worst:.2} times the error of a board without any.",
             over_ideal.len(),
             summary.board.len()
+        );
+    }
+    text.push('\n');
+}
+
+/// Forms of what is left, effect by effect.
+fn forms_table(text: &mut String, lines: &[FormLine]) {
+    if lines.is_empty() {
+        return;
+    }
+    text.push_str(
+        "## Not in the library: the form of what is left\n\nWhere no effect accounts for a mismatch, the report says which simple function of the \
+         recorded inputs takes nineteen twentieths of what is left beyond the noise, if one does: no name, but what to look for. Which is true of which effect was \
+         written down [before](../../proof/src/forms.rs).\n\n\
+         | hidden | data | true form | cases | told | another told |\n|---|---|---|---|---|---|\n",
+    );
+    for line in lines {
+        let right = if line.right.is_empty() {
+            "none".to_owned()
+        } else {
+            line.right.join(" or ")
+        };
+        let told = if line.right.is_empty() {
+            "–".to_owned()
+        } else {
+            line.told.to_string()
+        };
+        let _ = writeln!(
+            text,
+            "| {} | ({}) | {right} | {} | {told} | {} |",
+            line.effect, line.kind, line.cases, line.another
         );
     }
     text.push('\n');

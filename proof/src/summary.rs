@@ -10,6 +10,7 @@ use serde::Serialize;
 use crate::{
     board::Calibrated,
     case::{Group, Truth},
+    forms::{self, Told},
     methods::Found,
     run::Record,
     score::{self, Judgement, Outcome, PLAIN},
@@ -257,6 +258,8 @@ pub struct Summary {
     pub without: Counts,
     /// Something is hidden that the library does not have, by who made the data.
     pub outside: Vec<Counts>,
+    /// Which form of what is left was told of them, by effect and by who made the data.
+    pub forms: Vec<FormLine>,
     /// One effect at strength 3, by who made the data: right.
     pub just_plain: Vec<(String, Share)>,
     /// Intervals of real recordings that meet what counts as right of a published parameter.
@@ -279,6 +282,23 @@ pub struct Summary {
     pub targets: Vec<Target>,
     /// One short line a case.
     pub records: Vec<Line>,
+}
+
+/// Forms that were told of one effect outside the library.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct FormLine {
+    /// The effect.
+    pub effect: String,
+    /// Who made the data.
+    pub kind: String,
+    /// Forms that are true of it.
+    pub right: Vec<String>,
+    /// Cases.
+    pub cases: usize,
+    /// Told a true form, or one that is said not to be told apart from one.
+    pub told: usize,
+    /// Told another.
+    pub another: usize,
 }
 
 /// A case in short.
@@ -344,6 +364,39 @@ impl Scored<'_> {
         let nothing = self.truth.effects.is_empty() || self.hidden();
         !nothing && self.record.planned.group != Group::Cells
     }
+}
+
+/// See [`Summary::forms`].
+fn form_lines(scored: &[Scored<'_>]) -> Vec<FormLine> {
+    let mut lines: BTreeMap<(String, String), FormLine> = BTreeMap::new();
+    for one in scored.iter().filter(|one| one.outside()) {
+        let (Some(effect), Some(said)) =
+            (one.record.planned.case.effects.first(), &one.record.said)
+        else {
+            continue;
+        };
+        let Some(right) = forms::of(&effect.id) else {
+            continue;
+        };
+        let kind = one.truth.kind.clone();
+        let line = lines
+            .entry((kind.clone(), effect.id.clone()))
+            .or_insert_with(|| FormLine {
+                effect: effect.id.clone(),
+                kind,
+                right: right.iter().map(|form| (*form).to_owned()).collect(),
+                cases: 0,
+                told: 0,
+                another: 0,
+            });
+        line.cases += 1;
+        match forms::judged(right, &said.forms) {
+            Told::Right => line.told += 1,
+            Told::Another => line.another += 1,
+            Told::None => {}
+        }
+    }
+    lines.into_values().collect()
 }
 
 /// Counts the outcomes of some cases.
@@ -510,6 +563,7 @@ pub fn summary(
         }),
         without,
         outside,
+        forms: form_lines(&scored),
         just_plain,
         published,
         real,
@@ -1279,6 +1333,36 @@ mod tests {
             })
             .collect();
         assert_eq!(shares, [("b", 1, 2), ("d", 0, 1)]);
+    }
+
+    #[test]
+    fn forms_of_what_is_left_are_counted_where_the_library_lacks_the_effect() {
+        let quadratic = |forms: &[&str]| {
+            let truth = json!({ "effects": [{ "id": "quadratic" }] });
+            let mut one = record("outside", "d", 10.0, truth, &[]);
+            one["said"]["forms"] = json!(forms);
+            one
+        };
+        let mut inside = gain("single", "d", 10.0, &["gain"]);
+        inside["said"]["forms"] = json!(["step"]);
+        let summary = summed(vec![
+            quadratic(&["square"]),
+            quadratic(&["cube", "square"]),
+            quadratic(&["drift"]),
+            quadratic(&[]),
+            inside,
+        ]);
+        assert_eq!(
+            summary.forms,
+            [FormLine {
+                effect: "quadratic".into(),
+                kind: "d".into(),
+                right: vec!["square".into()],
+                cases: 4,
+                told: 2,
+                another: 1,
+            }]
+        );
     }
 
     #[test]

@@ -85,6 +85,9 @@ pub struct Said {
     pub named: Vec<Named>,
     /// Regions only.
     pub locations: Vec<Location>,
+    /// Simple forms of what is left: the first with those that it is not told apart from, by id.
+    #[serde(default)]
+    pub forms: Vec<String>,
     /// By column.
     pub held_out: BTreeMap<String, HeldOut>,
     /// What it took.
@@ -306,10 +309,22 @@ fn read(report: &Value) -> Result<Said> {
             energy_share: number(&place["energy_share"]),
         })
         .collect();
+    let forms = list(&report["unexplained"])
+        .iter()
+        .map(|left| &left["form"])
+        .filter(|form| !form.is_null())
+        .flat_map(|form| {
+            let others = list(&form["equivalent_to"]);
+            std::iter::once(text(&form["id"]))
+                .chain(others.iter().map(|other| text(&other["id"])))
+                .collect::<Vec<_>>()
+        })
+        .collect();
     Ok(Said {
         verdict,
         named,
         locations,
+        forms,
         ..Said::default()
     })
 }

@@ -17,6 +17,7 @@ mod dropout;
 mod elsewhere;
 pub mod fit;
 pub mod flexible;
+mod form;
 pub mod held_out;
 pub mod intervals;
 mod lead_in;
@@ -305,8 +306,13 @@ fn tell(
         ));
     }
     let plain_residual = read.residual(&read.plain);
-    let noise = if problem.noise > 0.0 {
+    let left_by_noise = if problem.noise > 0.0 {
         read.noise_left(model, options.seed)
+    } else {
+        0.0
+    };
+    let noise = if problem.noise > 0.0 {
+        left_by_noise
     } else {
         robust::spread(&jumps(&shown.residual)) / std::f64::consts::SQRT_2
     };
@@ -341,6 +347,7 @@ fn tell(
             rmse: rms(shown.residual.iter().copied()),
             explainable_share: if left.is_real() { left.share } else { 0.0 },
             location: place,
+            form: form::form(&read, &shown.residual, left_by_noise),
         });
     }
     report.models.push(fitted(problem, &selection.fit));

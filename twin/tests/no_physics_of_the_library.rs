@@ -53,3 +53,29 @@ fn a_dead_sensor_is_clipped_by_nothing() {
         assert_eq!(report.verdict, Verdict::Unknown, "{seed}: {report:?}");
     }
 }
+
+#[test]
+fn what_is_left_of_another_physics_is_told_by_its_form() {
+    type Reads = fn(f64, f64) -> f64;
+    let cases: [(&str, Reads); 3] = [
+        ("square", |_, i| i + 4e-4 * i * i),
+        (
+            "slope-step",
+            |t_s, i| if t_s < 120.0 { i } else { 0.97 * i },
+        ),
+        ("direction", |_, i| if i > 0.0 { i } else { 1.03 * i }),
+    ];
+    for (id, reads) in cases {
+        let mut noise_a = noise(5, 0.15);
+        let (t_s, currents) = steps(5, 60.0, 3000, 10);
+        let readings = t_s.iter().zip(&currents);
+        let readings = readings.map(|(t_s, i)| reads(*t_s, *i) + noise_a());
+        let readings = readings.collect();
+        let report = said(sensor(t_s, currents, readings, 0.15), 5, &[]);
+        assert_eq!(report.verdict, Verdict::Unknown, "{id}: {}", report.summary);
+        let form = report.unexplained[0].form.as_ref();
+        let form = form.unwrap_or_else(|| panic!("{id}: {:?}", report.unexplained));
+        assert_eq!(form.id, id, "{form:?}");
+        assert!((form.rmse - 0.15).abs() < 0.01, "{form:?}");
+    }
+}

@@ -7,7 +7,7 @@ mod report_sample;
 use proptest::prelude::*;
 use serde_json::Value;
 use twin::report::{
-    data::{Report, SignalPlots},
+    data::{Form, OtherForm, Report, SignalPlots},
     html, json, text,
 };
 
@@ -101,10 +101,16 @@ fn json_holds_every_key_of_the_contract() {
         each("holdouts", &["file", "signal", "rmse_before", "rmse_after"]);
         each(
             "unexplained",
-            &["signal", "rmse", "explainable_share", "location"],
+            &["signal", "rmse", "explainable_share", "location", "form"],
         );
         for left in value["unexplained"].as_array().unwrap() {
             keys(&left["location"], &location);
+            if !left["form"].is_null() {
+                keys(
+                    &left["form"],
+                    &["id", "description", "equivalent_to", "rmse"],
+                );
+            }
         }
         for effect in value["effects"].as_array().unwrap() {
             for parameter in effect["parameters"].as_array().unwrap() {
@@ -177,7 +183,42 @@ fn spoil(report: &mut Report, number: f64) {
     for left in &mut report.unexplained {
         left.rmse = number;
         left.explainable_share = number;
+        if let Some(form) = &mut left.form {
+            form.rmse = number;
+        }
     }
+}
+
+#[test]
+fn a_form_of_what_is_left_is_said_on_the_terminal_on_the_page_and_to_programs() {
+    let mut report = report_sample::unknown();
+    report.unexplained[0].form = Some(Form {
+        id: "square".into(),
+        description: "+0.000500 A/A² times i², beside a straight line".into(),
+        equivalent_to: vec![OtherForm {
+            id: "direction".into(),
+            description: "0 % of i where i > 0, +2.00 % of i where i < 0".into(),
+        }],
+        rmse: 0.0803,
+    });
+    let said = "+0.000500 A/A² times i², beside a straight line, or 0 % of i where i > 0, +2.00 % of i where i < 0";
+    let words: Vec<String> = text::render(&report, 100)
+        .split_whitespace()
+        .map(str::to_owned)
+        .collect();
+    let terminal = words.join(" ");
+    assert!(
+        terminal.contains(&format!("It has a simple form: {said}")),
+        "{terminal}"
+    );
+    assert!(terminal.contains("0.0803 A would be left"), "{terminal}");
+    let page = html::render(&report);
+    assert!(page.contains(&said.replace('>', "&gt;").replace('<', "&lt;")));
+    let value: Value = serde_json::from_str(&json::render(&report)).unwrap();
+    assert_eq!(
+        value["unexplained"][0]["form"]["equivalent_to"][0]["id"],
+        "direction"
+    );
 }
 
 #[test]

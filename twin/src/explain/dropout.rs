@@ -348,6 +348,7 @@ pub(super) fn told(
         rmse: super::rms(left.iter().copied()),
         explainable_share: 0.0,
         location: most,
+        form: None,
     };
     Told {
         sentence,

@@ -238,7 +238,12 @@ fn repeats(series: &[f64], (by, reversed): Turn) -> bool {
 }
 
 /// A series on the drive's rows, at the rows of the observation.
-fn at_rows(bench: &Workbench<'_>, rows: &[usize], series: &[f64], earlier_s: f64) -> Vec<f64> {
+pub(super) fn at_rows(
+    bench: &Workbench<'_>,
+    rows: &[usize],
+    series: &[f64],
+    earlier_s: f64,
+) -> Vec<f64> {
     let drive = &bench.problem.drive;
     let observed = &bench.problem.observed;
     let mut current: Option<(usize, Cursor<'_>)> = None;

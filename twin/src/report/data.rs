@@ -231,6 +231,42 @@ pub struct Unexplained {
     pub explainable_share: f64,
     /// Where it is largest.
     pub location: Option<Location>,
+    /// The simple form that it has, if it has one.
+    pub form: Option<Form>,
+}
+
+/// A simple function of the recorded inputs that takes nearly all of what is left: a description, no effect of the library.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Form {
+    /// Which function: `step`, `slope-step` (in time), `step-over`, `slope-step-over` (where another quantity passes a value),
+    /// `direction`, `sign`, `square`, `cube`, `drift`, `slope-drift`, `itself`, `follows`, `follows-square`, `slope-follows`,
+    /// `memory`, `second-order`,
+    /// `speed-limit` or `toward-zero`.
+    pub id: String,
+    /// In words, with its values.
+    pub description: String,
+    /// Others that the recording does not tell apart from it.
+    pub equivalent_to: Vec<OtherForm>,
+    /// Root mean square of what it would leave on parts of the recording that it was not fitted on, in the signal's unit.
+    pub rmse: f64,
+}
+
+/// A form that another one is not told apart from.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct OtherForm {
+    /// As in [`Form`].
+    pub id: String,
+    /// In words, with its values.
+    pub description: String,
+}
+
+impl Form {
+    /// In words, with those that it is not told apart from.
+    pub fn said(&self) -> String {
+        let others = self.equivalent_to.iter().map(|other| &other.description);
+        let all = std::iter::once(&self.description).chain(others);
+        all.map(String::as_str).collect::<Vec<_>>().join(", or ")
+    }
 }
 
 /// Series for the pictures of one signal. All series have the length of `t_s`; NaN where there is no value.

@@ -741,8 +741,19 @@ fn unexplained(page: &mut String, report: &Report) {
             ),
         ));
     }
+    page.push_str("</tbody>\n</table>\n");
+    for left in &report.unexplained {
+        if let Some(form) = &left.form {
+            page.push_str(&format!(
+                "<p>What is left of {} has a simple form: <strong>{}</strong>. With it {} would be left, on parts of the recording that it was not fitted on. It is a description, and no effect of the library.</p>\n",
+                code(&left.signal),
+                escape(&form.said()),
+                escape(&quantity(&significant(form.rmse, 3), unit_of(report, &left.signal))),
+            ));
+        }
+    }
     page.push_str(
-        "</tbody>\n</table>\n<p class=\"hint\">The share that a smooth function could explain, on held-out blocks, is physics or wiring that the library does not hold. The rest depends on something that was not recorded, or is noise.</p>\n</section>\n",
+        "<p class=\"hint\">The share that a smooth function could explain, on held-out blocks, is physics or wiring that the library does not hold. The rest depends on something that was not recorded, or is noise.</p>\n</section>\n",
     );
 }
 

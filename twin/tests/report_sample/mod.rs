@@ -297,6 +297,7 @@ pub fn partly_explained_of(rows: usize) -> Report {
             rmse: held_out,
             explainable_share: 0.043,
             location: Some(location(LocationKind::Time, "t_s", "s", (Some(2_400.0), Some(2_580.0)), (0.68, 0.05), None)),
+            form: None,
         }],
         decisions: vec![
             "Timing first: delay and clock rate between recording and reference are zero within their intervals.".to_owned(),
