@@ -387,6 +387,17 @@ fn tell(
         left,
         (&vetoed, report),
     );
+    let form = report
+        .unexplained
+        .last()
+        .filter(|left| left.signal == problem.name)
+        .and_then(|left| left.form.as_ref());
+    if let Some(form) = form {
+        sentence.push_str(&format!(
+            " What is left has a simple form, though it is no effect of the library: {}.",
+            form.said()
+        ));
+    }
     if verdict != Verdict::Unknown {
         let left = others
             .iter()

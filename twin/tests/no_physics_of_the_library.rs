@@ -77,5 +77,6 @@ fn what_is_left_of_another_physics_is_told_by_its_form() {
         let form = form.unwrap_or_else(|| panic!("{id}: {:?}", report.unexplained));
         assert_eq!(form.id, id, "{form:?}");
         assert!((form.rmse - 0.15).abs() < 0.01, "{form:?}");
+        assert!(report.summary.contains(&form.said()), "{}", report.summary);
     }
 }

@@ -266,14 +266,6 @@ fn left(report: &Report, width: usize, fullness: Fullness) -> Vec<String> {
             quantity(&significant(left.rmse, 3), unit_of(report, &left.signal)),
         );
         wrap(&mut lines, &words, 0, width, fullness.notes());
-        if let Some(form) = &left.form {
-            let words = format!(
-                "It has a simple form: {} (a description, no effect of the library; {} would be left)",
-                form.said(),
-                quantity(&significant(form.rmse, 3), unit_of(report, &left.signal)),
-            );
-            wrap(&mut lines, &words, 0, width, fullness.notes());
-        }
     }
     more(&mut lines, report.unexplained.len(), shown, "remainder");
     let shown = fullness.entries.saturating_sub(1).min(3);
