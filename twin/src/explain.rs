@@ -6,7 +6,7 @@
 //! [`held_out`] says what a fit is worth on rows that it was not made of, and [`select`] decides. [`intervals`] and [`locate`] say how
 //! sure and where; `trust`, [`shape`] and `unfitted` take back names that the recording or other files do not bear out, `strays`
 //! looks at readings that no noise makes, `dropout` at stretches that no physics makes, `verdict` says what that makes (`quieter`: whether what works between the rows only evens
-//! out noise of the reference), `elsewhere` whether another start would do the same, and `told` puts the report together.
+//! out noise of the reference), `elsewhere` whether another start would do the same, `form` which simple form what is left has, and `told` puts the report together.
 //! Nothing here knows a file or an effect by name.
 
 mod apart;

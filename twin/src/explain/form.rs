@@ -93,7 +93,8 @@ pub(super) fn form(bench: &Workbench<'_>, residual: &[f64], noise: f64) -> Optio
             let taken = before - left.iter().sum::<f64>();
             let held = (0..residual.len()).filter(|&row| fold_of[row].is_some());
             let quiet: f64 = held.map(|row| shape.leaves(row, noise)).sum();
-            (taken >= TOLD * (before - quiet)).then_some((shape, left))
+            let beyond = before - quiet;
+            (beyond > BEYOND * quiet && taken >= TOLD * beyond).then_some((shape, left))
         })
         .collect();
     let total = |left: &[f64]| left.iter().sum::<f64>();
@@ -103,10 +104,10 @@ pub(super) fn form(bench: &Workbench<'_>, residual: &[f64], noise: f64) -> Optio
     // Of those that the readings do not tell apart the plainest.
     let plainest = tried.iter().map(|(shape, _)| shape.size()).min()?;
     tried.retain(|(shape, _)| shape.size() == plainest);
-    tried.truncate(MOST);
     if tried.iter().any(|(shape, _)| shape.id() == linear::LINE) {
         return None;
     }
+    tried.truncate(MOST);
     let all: Vec<bool> = fold_of.iter().map(Option::is_some).collect();
     let rmse = (total(&tried.first()?.1) / rows.max(1) as f64).sqrt();
     let mut told = tried.iter().filter_map(|(shape, _)| {
