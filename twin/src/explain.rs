@@ -306,16 +306,9 @@ fn tell(
         ));
     }
     let plain_residual = read.residual(&read.plain);
-    let left_by_noise = if problem.noise > 0.0 {
-        read.noise_left(model, options.seed)
-    } else {
-        0.0
-    };
-    let noise = if problem.noise > 0.0 {
-        left_by_noise
-    } else {
-        robust::spread(&jumps(&shown.residual)) / std::f64::consts::SQRT_2
-    };
+    let stated = (problem.noise > 0.0).then(|| read.noise_left(model, options.seed));
+    let noise = stated
+        .unwrap_or_else(|| robust::spread(&jumps(&shown.residual)) / std::f64::consts::SQRT_2);
     report.signals.push(SignalReport {
         name: problem.name.clone(),
         unit: problem.unit.clone(),
@@ -338,7 +331,9 @@ fn tell(
     report
         .holdouts
         .extend(others.iter().map(|other| other.report(model)));
+    let mut form = None;
     if leaves_something {
+        form = form::form(&read, &shown.residual, stated.unwrap_or(0.0));
         let place = locate::locate(&read, &shown.residual, options.seed)
             .into_iter()
             .next();
@@ -347,7 +342,7 @@ fn tell(
             rmse: rms(shown.residual.iter().copied()),
             explainable_share: if left.is_real() { left.share } else { 0.0 },
             location: place,
-            form: form::form(&read, &shown.residual, left_by_noise),
+            form: form.clone(),
         });
     }
     report.models.push(fitted(problem, &selection.fit));
@@ -387,11 +382,6 @@ fn tell(
         left,
         (&vetoed, report),
     );
-    let form = report
-        .unexplained
-        .last()
-        .filter(|left| left.signal == problem.name)
-        .and_then(|left| left.form.as_ref());
     if let Some(form) = form {
         sentence.push_str(&format!(
             " What is left has a simple form, though it is no effect of the library: {}.",

@@ -76,16 +76,18 @@ pub(super) fn form(bench: &Workbench<'_>, residual: &[f64], noise: f64) -> Optio
     if before.is_nan() || before - quiet <= BEYOND * quiet {
         return None;
     }
+    let trained: Vec<Vec<bool>> = (0..FOLDS)
+        .map(|fold| {
+            let of = fold_of.iter();
+            of.map(|of| of.is_some_and(|of| of != fold)).collect()
+        })
+        .collect();
     let mut tried: Vec<(Box<dyn Shape + '_>, Vec<f64>)> = shapes(bench, residual, noise)
         .into_par_iter()
         .filter_map(|shape| {
             let mut made = vec![0.0; residual.len()];
-            for fold in 0..FOLDS {
-                let trained: Vec<bool> = fold_of
-                    .iter()
-                    .map(|of| of.is_some_and(|of| of != fold))
-                    .collect();
-                let series = shape.made(residual, &trained)?.series;
+            for (fold, trained) in trained.iter().enumerate() {
+                let series = shape.made(residual, trained)?.series;
                 let held = (0..series.len()).filter(|&row| fold_of[row] == Some(fold));
                 held.for_each(|row| made[row] = series[row]);
             }

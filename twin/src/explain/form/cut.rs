@@ -80,23 +80,28 @@ impl<'a> Cut<'a> {
     }
 }
 
+/// Products of some rows' carrier with the residual, and with itself, summed.
+fn sums(rows: impl Iterator<Item = usize>, carrier: &[f64], residual: &[f64]) -> (f64, f64) {
+    rows.fold((0.0, 0.0), |(cr, cc), row| {
+        let c = carrier[row];
+        (cr + c * residual[row], cc + c * c)
+    })
+}
+
 /// Where a residual over a carrier steps most: the least value of the variable beyond.
 fn cut(variable: &[f64], carrier: &[f64], residual: &[f64]) -> Option<f64> {
     let mut order: Vec<usize> = (0..variable.len())
         .filter(|&row| variable[row].is_finite())
         .collect();
     order.sort_by(|&a, &b| variable[a].total_cmp(&variable[b]));
-    let sums = order.iter().fold((0.0, 0.0), |(cr, cc), &row| {
-        let c = carrier[row];
-        (cr + c * residual[row], cc + c * c)
-    });
-    let least = LEAST_SIDE * sums.1;
+    let all = sums(order.iter().copied(), carrier, residual);
+    let least = LEAST_SIDE * all.1;
     let mut below = (0.0, 0.0);
     let mut last = f64::NAN;
     let mut best: Option<(f64, f64)> = None;
     for (count, &row) in order.iter().enumerate() {
         let value = variable[row];
-        let above = (sums.0 - below.0, sums.1 - below.1);
+        let above = (all.0 - below.0, all.1 - below.1);
         let are_rows = count >= LEAST_ROWS && order.len() - count >= LEAST_ROWS;
         if value > last && are_rows && below.1 > least && above.1 > least {
             let takes = below.0 * below.0 / below.1 + above.0 * above.0 / above.1;
@@ -132,10 +137,7 @@ impl Shape for Cut<'_> {
                 let value = self.variable[row];
                 trained[row] && value.is_finite() && (value >= at) == is_above
             });
-            let (cr, cc) = rows.fold((0.0, 0.0), |(cr, cc), row| {
-                let c = self.carrier[row];
-                (cr + c * residual[row], cc + c * c)
-            });
+            let (cr, cc) = sums(rows, &self.carrier, residual);
             if cc > 0.0 { cr / cc } else { 0.0 }
         };
         let [low, high] = [side(false), side(true)];

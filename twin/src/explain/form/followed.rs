@@ -13,6 +13,8 @@ const CLOSER: usize = 3;
 const TURNS: [f64; 2] = [0.01, 3.0];
 const FREQUENCIES: usize = 20;
 const DAMPINGS: [f64; 6] = [0.03, 0.1, 0.2, 0.4, 0.7, 0.95];
+/// Least of 1 − ζ², with which both poles are still told apart.
+const LEAST_APART: f64 = 1e-6;
 /// How often the steps by which both are then found become smaller, and by what.
 const SMALLER: usize = 12;
 const BY: f64 = 0.6;
@@ -153,6 +155,7 @@ struct SecondOrder<'a> {
     timing: Timing<'a>,
     /// Logarithms of the angular frequency in 1/s and of the damping from where they are found.
     start: [f64; 2],
+    /// First steps of both.
     steps: [f64; 2],
 }
 
@@ -178,7 +181,8 @@ impl<'a> SecondOrder<'a> {
     /// Exact for straight lines between the rows: y = 2·Re(c·z), z′ = p·z + x, with the pole p = ω·(−ζ + j·√(1 − ζ²)) and c = ω²/(p − p*).
     fn follows(&self, at: [f64; 2]) -> Vec<f64> {
         let [turns, damping] = at.map(f64::exp);
-        let pole = Complex::new(-damping, (1.0 - damping * damping).max(1e-6).sqrt()) * turns;
+        let pole =
+            Complex::new(-damping, (1.0 - damping * damping).max(LEAST_APART).sqrt()) * turns;
         let factor = Complex::new(turns * turns, 0.0) / (pole - pole.conj());
         let mut known = (f64::NAN, [Complex::default(); 3]);
         self.timing.followed(

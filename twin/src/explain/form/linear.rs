@@ -13,6 +13,9 @@ const SIGN_LOST: f64 = 0.02;
 /// Times that a memory is made of, each three times the one before, from a step of the recording on to a quarter of its length.
 const TIMES: usize = 8;
 
+/// Damping of the normal equations, as a share of each column's own energy: times of a memory are much alike.
+const DAMPING: f64 = 1e-12;
+
 /// What a linear form's values say.
 type Told<'a> = Box<dyn Fn(&[f64]) -> String + Sync + Send + 'a>;
 
@@ -35,7 +38,7 @@ impl Shape for Linear<'_> {
     fn made(&self, residual: &[f64], trained: &[bool]) -> Option<Made> {
         let weights: Vec<f64> = trained.iter().map(|t| f64::from(u8::from(*t))).collect();
         let (matrix, right) = normal(&self.columns, &weights, residual, 0..residual.len());
-        let values: Vec<f64> = solve(&matrix, &right, 1e-12).iter().copied().collect();
+        let values: Vec<f64> = solve(&matrix, &right, DAMPING).iter().copied().collect();
         let mut series = vec![0.0; residual.len()];
         for (column, value) in self.columns.iter().zip(&values) {
             let pairs = series.iter_mut().zip(column);

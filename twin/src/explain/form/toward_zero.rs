@@ -1,6 +1,7 @@
 //! Readings that are cut to whole steps toward zero, and not rounded to the nearest.
 
 use super::{Made, Says, Shape};
+use crate::effects::quantisation::lattice;
 use crate::explain::workbench::Workbench;
 use crate::report::format::at_most;
 
@@ -15,32 +16,12 @@ pub(super) fn of<'a>(
     noise: f64,
     says: Says<'a>,
 ) -> Option<Box<dyn Shape + 'a>> {
-    let step = grid(&bench.y);
+    let step = lattice(&bench.y)?;
     let pairs = bench.y.iter().zip(residual);
     let signal: Vec<f64> = pairs
         .map(|(reading, residual)| reading - residual)
         .collect();
-    (step > 0.0)
-        .then(|| Box::new(TowardZero::new(&signal, step, noise, says)) as Box<dyn Shape + 'a>)
-}
-
-/// Step of which all readings are whole multiples, or 0 where there is none: the least distance of two different ones.
-fn grid(readings: &[f64]) -> f64 {
-    let mut sorted = readings.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let steps = sorted.windows(2).map(|pair| pair[1] - pair[0]);
-    let step = steps
-        .filter(|step| *step > 0.0)
-        .fold(f64::INFINITY, f64::min);
-    let is_whole = |reading: &f64| {
-        let steps = reading / step;
-        (steps - steps.round()).abs() < 1e-6 * steps.abs().max(1.0)
-    };
-    if step.is_finite() && readings.iter().all(is_whole) {
-        step
-    } else {
-        0.0
-    }
+    Some(Box::new(TowardZero::new(&signal, step, noise, says)))
 }
 
 /// See the module.
