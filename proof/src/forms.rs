@@ -1,10 +1,10 @@
 //! Which simple form of what is left is true of an effect that the library lacks.
 
 /// Effects outside the library with the forms that describe them (`form` in report.json); none where nothing simple does. Written down
-/// before the campaign was run with forms.
+/// before the campaign was run with forms, `curve` (true of whatever follows the current at once) before it was run with that.
 const FORMS: [(&str, &[&str]); 15] = [
-    ("quadratic", &["square"]),
-    ("cubic", &["cube"]),
+    ("quadratic", &["square", "curve"]),
+    ("cubic", &["cube", "curve"]),
     ("gain-step", &["slope-step"]),
     ("aux-squared", &["follows-square"]),
     ("eddy-current", &["memory"]),
@@ -15,9 +15,9 @@ const FORMS: [(&str, &[&str]); 15] = [
     ("contact-resistance-rise", &["slope-drift"]),
     ("loose-contact", &[]),
     ("ocv-step", &["step-over"]),
-    ("charge-resistance", &["direction"]),
+    ("charge-resistance", &["direction", "curve"]),
     ("resonance", &["second-order"]),
-    ("crossover", &["sign"]),
+    ("crossover", &["sign", "curve"]),
 ];
 
 /// How the form that was told stands to the true one.

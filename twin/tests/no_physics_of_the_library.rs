@@ -40,7 +40,68 @@ fn a_state_of_charge_that_is_corrected_once_is_no_capacity() {
     for (points, seed) in [(10.0, 1), (7.0, 2), (-5.0, 3), (-8.0, 4)] {
         let report = corrected_once(points, seed);
         assert_eq!(report.verdict, Verdict::Unknown, "{points}: {report:?}");
+        let form = report.unexplained[0].form.as_ref();
+        let form = form.unwrap_or_else(|| panic!("{points}: {:?}", report.unexplained));
+        assert_eq!(form.id, "step", "{form:?}");
+        let step = form.description.split(" until 1200.0 s, ").nth(1);
+        let step = step.and_then(|step| step.split(' ').next());
+        let step: f64 = step.unwrap().replace('−', "-").parse().unwrap();
+        assert!((step - points).abs() < 0.1, "{points}: {form:?}");
     }
+}
+
+/// What is said of a state of charge in steps of half a per cent that reads the load's drop of the voltage as charge.
+#[test]
+fn a_state_of_charge_that_falls_with_the_load_is_told_by_the_current() {
+    let mut load_a = noise(5, 25.0);
+    let (mut charge_c, mut current_a) = (0.0, 30.0);
+    let mut text = "t_s,i_ref_a,soc_pct\n".to_owned();
+    for second in 0..2000 {
+        let before_a = current_a;
+        if second % 20 == 0 {
+            current_a = 10.0 + load_a();
+        }
+        charge_c += 0.5 * (before_a + current_a);
+        let soc_pct = 100.0 * (0.9 - charge_c / 3600.0 / 60.0) - 0.05 * current_a;
+        let read_pct = (2.0 * soc_pct).round() / 2.0;
+        text.push_str(&format!("{second},{current_a},{read_pct}\n"));
+    }
+    let model = "schema = 1\n[battery]\ncapacity_ah = 60.0\ninitial_soc = 0.9\n";
+    let mut prepared = prepared(&text, model);
+    let report = said(prepared.items.remove(0).problem, 5, &[]);
+    assert_eq!(report.verdict, Verdict::Unknown, "{report:?}");
+    let form = report.unexplained[0].form.as_ref().expect("a form");
+    assert_eq!(form.id, "follows", "{form:?}");
+    assert!(form.description.starts_with("−0.05"), "{form:?}");
+    assert!(form.description.ends_with(" % per A of i"), "{form:?}");
+}
+
+/// A counter that counts less of what is charged than of what is drawn.
+#[test]
+fn a_counter_that_counts_one_direction_otherwise_is_told_so() {
+    let mut load_a = noise(6, 40.0);
+    let mut noise_c = noise(7, 0.1);
+    let (mut counted_c, mut current_a) = (0.0, 0.0);
+    let mut text = "t_s,i_ref_a,q_meas_c\n".to_owned();
+    for second in 0..2000 {
+        let before_a: f64 = current_a;
+        if second % 20 == 0 {
+            current_a = load_a();
+        }
+        let mean_a = 0.5 * (before_a + current_a);
+        counted_c += mean_a * if mean_a < 0.0 { 0.96 } else { 1.0 };
+        let read_c = counted_c + noise_c();
+        text.push_str(&format!("{second},{current_a},{read_c:.4}\n"));
+    }
+    let mut prepared = prepared(&text, "schema = 1\n[sensor]\n[charge]\nnoise_c = 0.1\n");
+    let report = said(prepared.items.remove(0).problem, 5, &[]);
+    assert_eq!(report.verdict, Verdict::Unknown, "{report:?}");
+    let form = report.unexplained[0].form.as_ref().expect("a form");
+    assert_eq!(form.id, "direction", "{form:?}");
+    assert!(
+        form.description.ends_with("−4.00 % of i where i < 0"),
+        "{form:?}"
+    );
 }
 
 #[test]

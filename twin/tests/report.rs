@@ -194,14 +194,14 @@ fn a_form_of_what_is_left_is_said_on_the_page_and_to_programs() {
     let mut report = report_sample::unknown();
     report.unexplained[0].form = Some(Form {
         id: "square".into(),
-        description: "+0.000500 A/A² times i², beside a straight line".into(),
+        description: "+0.100 A, +1.00 % of i and +0.000500 A/A² times i²".into(),
         equivalent_to: vec![OtherForm {
             id: "direction".into(),
             description: "0 % of i where i > 0, +2.00 % of i where i < 0".into(),
         }],
         rmse: 0.0803,
     });
-    let said = "+0.000500 A/A² times i², beside a straight line, or 0 % of i where i > 0, +2.00 % of i where i < 0";
+    let said = "+0.100 A, +1.00 % of i and +0.000500 A/A² times i², or 0 % of i where i > 0, +2.00 % of i where i < 0";
     let page = html::render(&report);
     assert!(page.contains(&said.replace('>', "&gt;").replace('<', "&lt;")));
     let value: Value = serde_json::from_str(&json::render(&report)).unwrap();

@@ -6,12 +6,10 @@
 
 use std::sync::Arc;
 
-use super::means::Means;
+use super::means::{Means, MeansOfMean};
 use super::scene::{Cursor, Scene, floored};
 use crate::problem::Series;
 
-/// Parts of a row, of each of which a mean of means is worked out.
-const PARTS: f64 = 4.0;
 /// So many rows long is a window at most that is slid over a sliding mean.
 const SHORT: f64 = 2.0;
 /// Time constants after which a decay is less than the last digit of what it began with.
@@ -196,55 +194,87 @@ impl Decaying<'_> {
         self.of(t)
             .map_or(0.0, |since| tau_s * (since.jumped - since.at(t, tau_s)))
     }
+
+    /// Integral of [`Decaying::until`] from one time to a later one.
+    fn integral_until(&mut self, from: f64, to: f64) -> f64 {
+        let before = self.until(from);
+        let mut jumped = 0.0;
+        let mut at = from;
+        while at < to {
+            let next = self
+                .since
+                .get(self.begun)
+                .map_or(to, |next| next.t_s.min(to));
+            let last = self.since[..self.begun].last();
+            jumped += last.map_or(0.0, |since| since.jumped) * (next - at);
+            at = next;
+            self.begun += usize::from(at < to);
+        }
+        let tau_s = self.tau_s;
+        tau_s * (jumped - (self.until(to) - before))
+    }
 }
 
-/// The signal of a segment, at any time.
+/// The signal of a segment, at times that mostly go forward.
 struct Course<'s> {
     between: &'s Between,
     /// Straight lines: the signal, or what goes into its low-pass.
     lines: &'s [f64],
     held: bool,
-    /// Where means begin, and where they end.
+    at: Place<'s>,
+    /// Where a mean is ahead of the converter: the lines behind it, and the place a window earlier.
+    ahead: Option<(MeansOfMean<'s>, Place<'s>)>,
+}
+
+/// Where stretches of the signal begin, and where they end.
+struct Place<'s> {
     cursors: [Cursor<'s>; 2],
     decays: [Vec<Decaying<'s>>; 2],
-    /// Of the lines.
+    /// Of the lines; nothing without a converter.
     means: Option<Means<'s>>,
-    /// Mean step between rows.
-    step_s: f64,
+    held: bool,
 }
 
 impl<'s> Course<'s> {
     fn of(scene: &'s Scene<'_>, segment: usize) -> Self {
         let (drive, between) = (scene.drive, &scene.between);
-        let (rows, held) = (drive.segments[segment].clone(), scene.held());
+        let held = scene.held();
         let lines = match &between.low_pass {
             Some(low_pass) => &low_pass.input[..],
             None => &scene.signal[..],
         };
-        let means = between.converter.is_some();
-        let means = means.then(|| scene.steps.means(drive, segment, lines, held));
-        let span_s = drive.t_s[rows.end - 1] - drive.t_s[rows.start];
-        let step_s = span_s / (rows.len() - 1).max(1) as f64;
-        let cursor = Cursor::new(&drive.t_s, rows);
         let decays = between.decays.iter().map(|decay| Decaying {
             tau_s: decay.tau_s,
             since: &decay.since[segment],
             begun: 0,
         });
         let decays: Vec<Decaying<'_>> = decays.collect();
+        let place = || {
+            let cursor = Cursor::new(&drive.t_s, drive.segments[segment].clone());
+            let means = between.converter.is_some();
+            Place {
+                cursors: [cursor.clone(), cursor],
+                decays: [decays.clone(), decays.clone()],
+                means: means.then(|| scene.steps.means(drive, segment, lines, held)),
+                held,
+            }
+        };
+        let window_s = between.mean_ahead_s;
+        let ahead = (window_s > 0.0).then(|| {
+            let of_lines = MeansOfMean::new(drive, segment, lines, held, window_s);
+            (of_lines, place())
+        });
         Self {
             between,
             lines,
             held,
-            cursors: [cursor.clone(), cursor],
-            decays: [decays.clone(), decays],
-            means,
-            step_s,
+            at: place(),
+            ahead,
         }
     }
 
     fn value(&mut self, t: f64) -> f64 {
-        let cursor = &mut self.cursors[0];
+        let cursor = &mut self.at.cursors[0];
         let straight = match &self.between.low_pass {
             Some(low_pass) => {
                 cursor.seek(t);
@@ -252,54 +282,68 @@ impl<'s> Course<'s> {
             }
             None => cursor.value(self.lines, t, self.held),
         };
-        let decays = self.decays[0].iter_mut();
+        let decays = self.at.decays[0].iter_mut();
         straight + decays.map(|decay| decay.value(t)).sum::<f64>()
     }
 
     /// Mean from one time to a later one; beyond the ends the lines hold their end values.
     fn mean(&mut self, from_s: f64, to_s: f64) -> f64 {
         let window_s = self.between.mean_ahead_s;
-        if window_s <= 0.0 {
+        let length_s = to_s - from_s;
+        let Some((of_lines, earlier)) = &mut self.ahead else {
             return self.mean_of_signal(from_s, to_s);
+        };
+        if length_s.is_nan() || length_s <= 0.0 {
+            return self.mean_of_signal(to_s - window_s, to_s);
         }
-        // A sliding mean is a parabola between those times at which a row comes into it or goes out: two points of each part (Gauss and
-        // Legendre's) are enough but next to those. Where the rows are closer than elsewhere there are no more parts for it.
-        let parts = (PARTS * (to_s - from_s) / self.step_s)
-            .ceil()
-            .clamp(1.0, 2.0 * PARTS * SHORT);
-        let part_s = (to_s - from_s) / parts;
-        let mut sum = 0.0;
-        for part in 0..parts as usize {
-            let middle_s = from_s + part_s * (part as f64 + 0.5);
-            for side in [-0.5, 0.5] {
-                let t = middle_s + side * part_s / 3f64.sqrt();
-                sum += self.mean_of_signal(t - window_s, t);
-            }
+        let mut mean = of_lines.mean(from_s, to_s);
+        let before = [from_s - window_s, to_s - window_s];
+        if let Some(low_pass) = &self.between.low_pass {
+            // The mean of ∫y = ∫x − τ·Δy over the window.
+            let now = self.at.mean(Some(low_pass), from_s, to_s);
+            let then = earlier.mean(Some(low_pass), before[0], before[1]);
+            mean -= low_pass.tau_s * (now - then) / window_s;
         }
-        0.5 * sum / parts
+        let now = self.at.decays[0].iter_mut();
+        let decays = now.zip(&mut earlier.decays[0]).map(|(now, then)| {
+            now.integral_until(from_s, to_s) - then.integral_until(before[0], before[1])
+        });
+        mean + decays.sum::<f64>() / (window_s * length_s)
     }
 
     fn mean_of_signal(&mut self, from_s: f64, to_s: f64) -> f64 {
-        let Some(means) = self.means.as_mut().filter(|_| to_s > from_s) else {
-            return self.value(to_s);
-        };
         let length_s = to_s - from_s;
-        let mut mean = means.mean(from_s, to_s);
-        if let Some(low_pass) = &self.between.low_pass {
-            // ∫y = ∫x − τ·Δy.
-            let [from, to] = &mut self.cursors;
-            from.seek(from_s);
-            to.seek(to_s);
-            let at = |cursor: &Cursor<'_>, t| low_pass.beyond(cursor, t, self.held);
-            mean -= low_pass.tau_s * (at(to, to_s) - at(from, from_s)) / length_s;
+        if self.at.means.is_none() || length_s.is_nan() || length_s <= 0.0 {
+            return self.value(to_s);
         }
+        let mean = self.at.mean(self.between.low_pass.as_ref(), from_s, to_s);
         if self.between.decays.is_empty() {
             return mean;
         }
-        let [from, to] = &mut self.decays;
+        let [from, to] = &mut self.at.decays;
         let ends = from.iter_mut().zip(to);
         let decayed = ends.map(|(from, to)| to.until(to_s) - from.until(from_s));
         mean + decayed.sum::<f64>() / length_s
+    }
+}
+
+impl Place<'_> {
+    /// Mean of the lines, or of what comes out of their low-pass, from one time to a later one.
+    #[inline]
+    fn mean(&mut self, low_pass: Option<&LowPass>, from_s: f64, to_s: f64) -> f64 {
+        let Some(means) = &mut self.means else {
+            return f64::NAN;
+        };
+        let mean = means.mean(from_s, to_s);
+        let Some(low_pass) = low_pass else {
+            return mean;
+        };
+        // ∫y = ∫x − τ·Δy.
+        let [from, to] = &mut self.cursors;
+        from.seek(from_s);
+        to.seek(to_s);
+        let at = |cursor: &Cursor<'_>, t| low_pass.beyond(cursor, t, self.held);
+        mean - low_pass.tau_s * (at(to, to_s) - at(from, from_s)) / (to_s - from_s)
     }
 }
 
@@ -569,7 +613,7 @@ mod tests {
 
     type Members = Vec<(&'static str, Vec<f64>)>;
 
-    /// Effects that look, or bend, between rows of 0.1 s; of converters there is one.
+    /// Effects that look, or bend, between rows of 0.1 s; of converters there is one, or a mean ahead of short windows.
     fn members() -> impl Strategy<Value = Members> {
         let tau_s = || (-3.0f64..0.0).prop_map(|power| 10f64.powf(power));
         let handover = tau_s().prop_map(|tau_s| ("range-handover", vec![tau_s]));
@@ -582,15 +626,25 @@ mod tests {
                 ("sampled-window", vec![period_s, duty, phase_s])
             }),
         ];
+        // Windows that are short beside a row look at what a mean makes between rows.
+        let short =
+            (0.001f64..0.15, -3.0f64..-1.7, 0.01f64..1.0).prop_map(|(window_s, power, duty)| {
+                let windows = ("sampled-window", vec![10f64.powf(power), duty, 0.0]);
+                vec![("moving-average", vec![window_s]), windows]
+            });
+        let converters = prop_oneof![converter.prop_map(|one| vec![one]), short];
         let option = prop::option::of::<BoxedStrategy<(&'static str, Vec<f64>)>>;
         let all = (
             option(handover.boxed()),
             option(delay.boxed()),
             option(skew.boxed()),
             option(lag.boxed()),
-            option(converter.boxed()),
+            prop::option::of(converters),
         );
-        all.prop_map(|(a, b, c, d, e)| [a, b, c, d, e].into_iter().flatten().collect())
+        all.prop_map(|(a, b, c, d, converters)| {
+            let ahead = [a, b, c, d].into_iter().flatten();
+            ahead.chain(converters.into_iter().flatten()).collect()
+        })
     }
 
     proptest! {

@@ -70,13 +70,7 @@ struct AnyMeans<'a> {
 impl<'a> AnyMeans<'a> {
     /// Over some rows; a cursor stands at one of them at first.
     fn new(t_s: &'a [f64], rows: Range<usize>, at: usize, input: &'a [f64], held: bool) -> Self {
-        let running = || Running {
-            first: input[at],
-            cursor: Cursor::within(t_s, rows.clone(), at),
-            input,
-            held,
-            sum: 0.0,
-        };
+        let running = || Running::new(t_s, rows.clone(), at, input, held);
         Self {
             ends: [running(), running()],
         }
@@ -104,22 +98,70 @@ struct Running<'a> {
     sum: f64,
 }
 
-impl Running<'_> {
+impl<'a> Running<'a> {
+    fn new(t_s: &'a [f64], rows: Range<usize>, at: usize, input: &'a [f64], held: bool) -> Self {
+        Self {
+            first: input[at],
+            cursor: Cursor::within(t_s, rows, at),
+            input,
+            held,
+            sum: 0.0,
+        }
+    }
+
     /// Beyond the ends the signal holds its end values.
     #[inline]
     fn until(&mut self, t: f64) -> f64 {
+        self.seek(t);
+        self.sum + self.cursor.beyond(self.input, t, self.held)
+            - self.first * self.cursor.since_s(t)
+    }
+
+    /// Moves to the last row not after a time.
+    #[inline]
+    fn seek(&mut self, t: f64) {
         while let Some(step_s) = self.cursor.step_s()
             && self.cursor.since_s(t) >= step_s
         {
-            self.sum += self.area(step_s);
+            self.sum += self.area(self.cursor.row(), step_s);
             self.cursor.forward();
         }
         while self.cursor.since_s(t) < 0.0 && self.cursor.back() {
             let step_s = self.cursor.step_s().unwrap_or_default();
-            self.sum -= self.area(step_s);
+            self.sum -= self.area(self.cursor.row(), step_s);
         }
-        self.sum + self.cursor.beyond(self.input, t, self.held)
-            - self.first * self.cursor.since_s(t)
+    }
+
+    /// Integral of [`Running::until`] from one time to a later one. It is a parabola between two rows: each of these pieces by itself, as
+    /// differences of sums over the whole recording would have lost their digits.
+    fn integral_until(&mut self, from: f64, to: f64) -> f64 {
+        self.seek(from);
+        let (mut cursor, mut sum) = (self.cursor.clone(), self.sum);
+        // Before the first row there is nothing more than its value.
+        let mut begin_s = cursor.since_s(from).max(0.0);
+        let mut integral = 0.0;
+        loop {
+            let row = cursor.row();
+            let step_s = cursor.step_s();
+            let passed_s = step_s.filter(|step_s| cursor.since_s(to) >= *step_s);
+            let end_s = passed_s.unwrap_or_else(|| cursor.since_s(to).max(begin_s));
+            let slope = match step_s {
+                Some(step_s) if !self.held && step_s > 0.0 => {
+                    (self.input[row + 1] - self.input[row]) / step_s
+                }
+                _ => 0.0,
+            };
+            let (length_s, middle_s) = (end_s - begin_s, 0.5 * (begin_s + end_s));
+            let mean_square = middle_s * middle_s + length_s * length_s / 12.0;
+            let more = self.input[row] - self.first;
+            integral += length_s * (sum + more * middle_s + 0.5 * slope * mean_square);
+            let Some(step_s) = passed_s else {
+                return integral;
+            };
+            sum += self.area(row, step_s);
+            cursor.forward();
+            begin_s = 0.0;
+        }
     }
 
     fn is_within_step(&self, from: f64, to: f64) -> bool {
@@ -128,14 +170,14 @@ impl Running<'_> {
             && step_s.is_some_and(|step_s| self.cursor.since_s(to) <= step_s)
     }
 
-    /// Over the step where the cursor stands.
+    /// Over the step that begins at a row.
     #[inline]
-    fn area(&self, step_s: f64) -> f64 {
-        let here = self.input[self.cursor.row()];
+    fn area(&self, row: usize, step_s: f64) -> f64 {
+        let here = self.input[row];
         let mean = if self.held {
             here
         } else {
-            0.5 * (here + self.input[self.cursor.row() + 1])
+            0.5 * (here + self.input[row + 1])
         };
         (mean - self.first) * step_s
     }
@@ -298,6 +340,41 @@ impl<'a> Means<'a> {
     }
 }
 
+/// Means of a sliding mean over stretches of time that mostly go forward.
+pub struct MeansOfMean<'a> {
+    first: f64,
+    window_s: f64,
+    /// The integral up to a time, and up to a window before it.
+    ends: [Running<'a>; 2],
+}
+
+impl<'a> MeansOfMean<'a> {
+    /// Over a segment, which is not to be empty, of a mean over the `window_s` before each time.
+    pub fn new(
+        drive: &'a Drive,
+        segment: usize,
+        input: &'a [f64],
+        held: bool,
+        window_s: f64,
+    ) -> Self {
+        let rows = drive.segments[segment].clone();
+        let running = || Running::new(&drive.t_s, rows.clone(), rows.start, input, held);
+        Self {
+            first: input[rows.start],
+            window_s,
+            ends: [running(), running()],
+        }
+    }
+
+    /// From one time to a later one, in s.
+    pub fn mean(&mut self, from_s: f64, to_s: f64) -> f64 {
+        let [late, early] = &mut self.ends;
+        let before = early.integral_until(from_s - self.window_s, to_s - self.window_s);
+        let integral = late.integral_until(from_s, to_s) - before;
+        self.first + integral / (self.window_s * (to_s - from_s))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -331,6 +408,37 @@ mod tests {
                         "{held} {length} {from}: {found} {expected}"
                     );
                     from += period;
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_mean_of_a_mean_is_that_of_many() {
+        const MANY: usize = 20_000;
+        // Uneven rows, two at one time.
+        let t_s: Vec<f64> = (0..60)
+            .map(|k| 0.1 * f64::from(k - k % 7 / 6) + 0.03 * f64::from(k % 7 % 3 % 2))
+            .collect();
+        let series: Vec<f64> = t_s.iter().map(|t| 300.0 + (3.0 * t).sin() + t).collect();
+        let drive = drive(&t_s);
+        for held in [false, true] {
+            let windows = [(0.03, 0.001), (0.03, 0.2), (0.7, 0.05), (2.0, 0.3)];
+            for (window_s, length_s) in windows {
+                let mut means = MeansOfMean::new(&drive, 0, &series, held, window_s);
+                let mut sliding = AnyMeans::new(&t_s, 0..60, 0, &series, held);
+                for begin in 0..20 {
+                    let from_s = -0.5 + 0.37 * f64::from(begin);
+                    let many = (0..MANY).map(|k| {
+                        let t = from_s + length_s * (k as f64 + 0.5) / MANY as f64;
+                        sliding.mean(t - window_s, t)
+                    });
+                    let expected = many.sum::<f64>() / MANY as f64;
+                    let found = means.mean(from_s, from_s + length_s);
+                    assert!(
+                        (found - expected).abs() < 1e-6,
+                        "{held} {window_s} {length_s} {from_s}: {found} {expected}"
+                    );
                 }
             }
         }

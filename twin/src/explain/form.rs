@@ -58,9 +58,7 @@ trait Shape: Sync + Send {
 /// The form of a residual over a bench's rows; `noise`: what a true model would leave, rms, 0 if that is not known. `None` where
 /// no form takes nearly all that is beyond the noise.
 pub(super) fn form(bench: &Workbench<'_>, residual: &[f64], noise: f64) -> Option<Form> {
-    if bench.blocks.len() < LEAST_BLOCKS
-        || !matches!(bench.problem.view, View::Sensor | View::Voltage)
-    {
+    if bench.blocks.len() < LEAST_BLOCKS {
         return None;
     }
     let fold_of = folds(bench);
@@ -155,11 +153,11 @@ fn shapes<'a>(bench: &'a Workbench<'_>, residual: &[f64], noise: f64) -> Vec<Box
     shapes
 }
 
-/// What readings are looked at over: what a sensor was to read, and the current of a battery.
+/// What readings are looked at over: what a sensor or a counter was to read, and the current of a battery.
 fn current<'a>(bench: &'a Workbench<'_>) -> &'a [f64] {
     match bench.problem.view {
-        View::Sensor => &bench.plain,
-        _ => &bench.reference,
+        View::Sensor | View::Charge => &bench.plain,
+        View::Voltage | View::StateOfCharge => &bench.reference,
     }
 }
 
@@ -170,20 +168,24 @@ struct Says<'a> {
     symbol: &'static str,
     /// The unit of what is read over: amperes, but for a sensor of something else.
     of: &'a str,
-    is_voltage: bool,
+    view: View,
 }
 
 impl<'a> Says<'a> {
     fn of(bench: &'a Workbench<'_>) -> Self {
         let unit = bench.problem.unit.as_str();
-        let is_voltage = bench.problem.view == View::Voltage;
-        let of = if is_voltage { "A" } else { unit };
+        let view = bench.problem.view;
+        let of = if view == View::Sensor { unit } else { "A" };
         Self {
             unit,
             symbol: if of == "A" { "i" } else { "x" },
             of,
-            is_voltage,
+            view,
         }
+    }
+
+    fn is_voltage(&self) -> bool {
+        self.view == View::Voltage
     }
 
     fn levels(&self, values: [f64; 2]) -> [String; 2] {
@@ -192,7 +194,7 @@ impl<'a> Says<'a> {
 
     /// Of what is proportional to the current, with its unit. Discharge is positive: more resistance is less voltage.
     fn factor(&self) -> (f64, String) {
-        if self.is_voltage {
+        if self.is_voltage() {
             (-1.0, " Ω".into())
         } else {
             (100.0, format!(" % of {}", self.symbol))
@@ -211,7 +213,7 @@ impl<'a> Says<'a> {
 
     /// What of a step is read, that is off by so much of it.
     fn of_step(&self, off: f64) -> String {
-        if self.is_voltage {
+        if self.is_voltage() {
             format!("{} Ω", signed(-off))
         } else {
             format!("{} %", significant(100.0 * (1.0 + off), 5))
@@ -225,17 +227,27 @@ fn signed(value: f64) -> String {
     format!("{sign}{}", significant(value.abs(), 3))
 }
 
-/// Two values with their signs, both to the place to which the larger has three digits: what is next to nothing is nothing.
+/// Two values with their signs, to the same place.
 fn alike(values: [f64; 2]) -> [String; 2] {
-    let most = values[0].abs().max(values[1].abs());
-    let place = 10f64.powf(most.log10().floor() - 2.0);
-    values.map(|value| {
-        if most > 0.0 && value.abs() < 0.5 * place {
-            "0".into()
-        } else {
-            signed((value / place).round() * place)
-        }
-    })
+    let place = place_of(&values);
+    values.map(|value| at_place(value, place))
+}
+
+/// The place to which the largest of some values has three digits.
+fn place_of(values: &[f64]) -> f64 {
+    let most = values
+        .iter()
+        .fold(0.0, |most: f64, value| most.max(value.abs()));
+    10f64.powf(most.log10().floor() - 2.0)
+}
+
+/// A value with its sign, to a place: what is next to nothing is nothing.
+fn at_place(value: f64, place: f64) -> String {
+    if value.abs() < 0.5 * place || place == 0.0 {
+        "0".into()
+    } else {
+        signed((value / place).round() * place)
+    }
 }
 
 #[cfg(test)]

@@ -27,9 +27,28 @@ const CHANCE: f64 = 0.05;
 /// Places that are named of each kind.
 const MOST: usize = 3;
 
+/// What an operating variable is of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// The reference itself.
+    Itself,
+    /// Its size.
+    Size,
+    /// How fast it changes.
+    Rate,
+    /// What was recorded beside it.
+    Beside,
+    /// The charge drawn.
+    Charge,
+    /// Time.
+    Time,
+}
+
 /// An operating variable at the rows that count.
 #[derive(Clone, Debug)]
 pub struct Variable {
+    /// What it is of.
+    pub kind: Kind,
     /// Its name.
     pub name: &'static str,
     /// Its unit.
@@ -55,11 +74,13 @@ pub fn variables(bench: &Workbench<'_>) -> Vec<Variable> {
     };
     let mut variables = vec![
         Variable {
+            kind: Kind::Size,
             name: size,
             unit: unit.clone(),
             values: x.iter().map(|x| x.abs()).collect(),
         },
         Variable {
+            kind: Kind::Itself,
             name: itself,
             unit: unit.clone(),
             values: x.clone(),
@@ -73,12 +94,14 @@ pub fn variables(bench: &Workbench<'_>) -> Vec<Variable> {
         }
     }
     variables.push(Variable {
+        kind: Kind::Rate,
         name: rate_of,
         unit: format!("{unit}/s"),
         values: rate,
     });
     for (name, unit, series) in drive.surroundings() {
         variables.push(Variable {
+            kind: Kind::Beside,
             name,
             unit: unit.to_owned(),
             values: at_rows(bench, series),
@@ -90,6 +113,7 @@ pub fn variables(bench: &Workbench<'_>) -> Vec<Variable> {
             .map(|q| q / 3600.0)
             .collect();
         variables.push(Variable {
+            kind: Kind::Charge,
             name: "charge drawn",
             unit: "Ah".to_owned(),
             values,

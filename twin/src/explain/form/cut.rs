@@ -1,15 +1,14 @@
 //! A form that steps where a variable passes a value: a level in time, a slope beyond a size of the current.
 
 use super::{Made, Says, Shape, current};
-use crate::explain::locate::{Variable, variables};
+use crate::explain::locate::{Kind, Variable, variables};
 use crate::explain::workbench::Workbench;
+use crate::problem::View;
 use crate::report::format::significant;
 
 /// Each side of a step has this share of the energy of what steps, and this many rows.
 const LEAST_SIDE: f64 = 0.01;
 const LEAST_ROWS: usize = 20;
-/// Time, as the report calls it.
-const TIME: &str = "t_s";
 
 /// All of them.
 pub(super) fn all<'a>(
@@ -18,19 +17,20 @@ pub(super) fn all<'a>(
     says: Says<'a>,
 ) -> Vec<Box<dyn Shape + 'a>> {
     let time = Variable {
-        name: TIME,
+        kind: Kind::Time,
+        name: "t_s",
         unit: "s".into(),
         values: bench.t_s.clone(),
     };
     let others = variables(bench).into_iter();
     // How fast the current changes makes no step of it.
-    let others = others.filter(|variable| !variable.name.starts_with("abs(d"));
+    let others = others.filter(|variable| variable.kind != Kind::Rate);
     let one = vec![1.0; bench.len()];
     let mut all: Vec<Box<dyn Shape + 'a>> = Vec::new();
     for variable in std::iter::once(time).chain(others) {
-        let is_size = variable.name.starts_with("abs(");
-        // Beyond a size of the current a slope of its own, as a second range has it; a slope for each sign is no step.
-        if !is_size {
+        // Beyond a size of the current a slope of its own, as a second range has it; a slope for each sign is no step, and a state of
+        // charge has none.
+        if variable.kind != Kind::Size {
             all.push(Box::new(Cut::new(
                 &variable,
                 one.clone(),
@@ -39,7 +39,7 @@ pub(super) fn all<'a>(
                 residual,
             )));
         }
-        if variable.name != says.symbol {
+        if variable.kind != Kind::Itself && says.view != View::StateOfCharge {
             let x = current(bench).to_vec();
             all.push(Box::new(Cut::new(&variable, x, true, says, residual)));
         }
@@ -49,6 +49,7 @@ pub(super) fn all<'a>(
 
 /// A level, or a slope over the current, that steps where a variable passes a value.
 struct Cut<'a> {
+    kind: Kind,
     name: &'static str,
     unit: String,
     variable: Vec<f64>,
@@ -69,6 +70,7 @@ impl<'a> Cut<'a> {
     ) -> Self {
         let at = cut(&variable.values, &carrier, residual);
         Self {
+            kind: variable.kind,
             name: variable.name,
             unit: variable.unit.clone(),
             variable: variable.values.clone(),
@@ -118,9 +120,9 @@ fn cut(variable: &[f64], carrier: &[f64], residual: &[f64]) -> Option<f64> {
 
 impl Shape for Cut<'_> {
     fn id(&self) -> &'static str {
-        match (self.name, self.is_slope) {
-            (TIME, false) => "step",
-            (TIME, true) => "slope-step",
+        match (self.kind, self.is_slope) {
+            (Kind::Time, false) => "step",
+            (Kind::Time, true) => "slope-step",
             (_, false) => "step-over",
             (_, true) => "slope-step-over",
         }
@@ -162,7 +164,7 @@ impl Shape for Cut<'_> {
         } else {
             self.says.levels([values[1], values[2]])
         };
-        if self.name == TIME {
+        if self.kind == Kind::Time {
             format!("{low} until {at:.1} s, {high} from then on")
         } else {
             let (name, unit) = (self.name, &self.unit);

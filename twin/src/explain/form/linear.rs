@@ -1,17 +1,25 @@
 //! Forms that are a weighted sum of a few columns: curves, drifts, slopes of their own, what follows another quantity, a memory.
 
-use super::{Made, Says, Shape, current, signed};
+use super::{Made, Says, Shape, at_place, current, place_of, signed};
 use crate::effects::scene::Steps;
 use crate::explain::flexible::at_rows;
-use crate::explain::locate::variables;
+use crate::explain::locate::{Kind, variables};
 use crate::explain::normal::{normal, solve};
 use crate::explain::workbench::Workbench;
+use crate::problem::View;
 use crate::report::format::significant;
 
 /// A slope is that of a lost sign within this.
 const SIGN_LOST: f64 = 0.02;
 /// Times that a memory is made of, each three times the one before, from a step of the recording on to a quarter of its length.
 const TIMES: usize = 8;
+
+/// Stretches of the current over each of which a curve of any shape is a straight line.
+const STRETCHES: usize = 12;
+/// Each has this many rows.
+const LEAST_ROWS: usize = 20;
+/// Places at which such a curve is told.
+const PLACES: usize = 7;
 
 /// Damping of the normal equations, as a share of each column's own energy: times of a memory are much alike.
 const DAMPING: f64 = 1e-12;
@@ -71,12 +79,20 @@ impl<'a> Linear<'a> {
 
 /// All of them.
 pub(super) fn all<'a>(bench: &'a Workbench<'_>, says: Says<'a>) -> Vec<Box<dyn Shape + 'a>> {
-    let mut all = vec![line(bench), direction(bench, says), sign(bench, says)];
-    all.extend(curves(bench, says));
+    let mut all = vec![line(bench)];
     all.extend(drifts(bench, says));
     all.extend(around(bench, says));
-    all.extend(memory(bench, says));
-    if says.is_voltage {
+    // What is charged is no share of a state of charge.
+    if says.view != View::StateOfCharge {
+        all.extend([direction(bench, says), sign(bench, says)]);
+        all.extend(curves(bench, says));
+        all.extend(curve(bench, says));
+    }
+    // A counter's differences are means over more than a row.
+    if matches!(says.view, View::Sensor | View::Voltage) {
+        all.extend(memory(bench, says));
+    }
+    if says.is_voltage() {
         let columns = vec![vec![1.0; bench.len()], bench.plain.clone()];
         all.push(Linear::new("itself", columns, |values| {
             format!("{} % of the voltage itself", signed(100.0 * values[1]))
@@ -91,11 +107,16 @@ fn times(a: &[f64], b: &[f64]) -> Vec<f64> {
     a.iter().zip(b).map(|(a, b)| a * b).collect()
 }
 
-/// What an offset and a gain make, which the library has: a form that is no better is none.
+/// What an offset and a gain make (of a state of charge its start and the capacity), which the library has: a form that is no better is
+/// none.
 pub(super) const LINE: &str = "line";
 
 fn line<'a>(bench: &Workbench<'_>) -> Linear<'a> {
-    let columns = vec![vec![1.0; bench.len()], current(bench).to_vec()];
+    let over = match bench.problem.view {
+        View::StateOfCharge => &bench.plain,
+        _ => current(bench),
+    };
+    let columns = vec![vec![1.0; bench.len()], over.to_vec()];
     Linear::new(LINE, columns, |_| "a straight line".into())
 }
 
@@ -108,8 +129,8 @@ fn sign<'a>(bench: &Workbench<'_>, says: Says<'a>) -> Linear<'a> {
     let columns = vec![x.to_vec(), sign.collect()];
     Linear::new("sign", columns, move |values| {
         let [above, below] = says.levels([values[1], -values[1]]);
-        let symbol = says.symbol;
-        format!("{above} where {symbol} > 0, {below} where {symbol} < 0, beside a slope")
+        let (symbol, slope) = (says.symbol, says.slope(values[0]));
+        format!("{above} where {symbol} > 0, {below} where {symbol} < 0, and {slope}")
     })
 }
 
@@ -122,7 +143,7 @@ fn direction<'a>(bench: &Workbench<'_>, says: Says<'a>) -> Linear<'a> {
     ];
     Linear::new("direction", columns, move |values| {
         let is_lost = |here: f64, there: f64| {
-            !says.is_voltage && (here + 2.0).abs() < SIGN_LOST && there.abs() < SIGN_LOST
+            !says.is_voltage() && (here + 2.0).abs() < SIGN_LOST && there.abs() < SIGN_LOST
         };
         let [above, below] = [values[0], values[1]];
         let lost = if is_lost(above, below) || is_lost(below, above) {
@@ -151,37 +172,98 @@ fn curves<'a>(bench: &Workbench<'_>, says: Says<'a>) -> [Linear<'a>; 2] {
     .map(|(id, column, power, factor)| {
         let columns = vec![vec![1.0; bench.len()], x.to_vec(), column];
         Linear::new(id, columns, move |values| {
+            let (level, slope) = (signed(values[0]), says.slope(values[1]));
             let size = signed(values[2]);
-            format!("{size} {factor} times {symbol}{power}, beside a straight line")
+            format!("{level} {unit}, {slope} and {size} {factor} times {symbol}{power}")
         })
     })
 }
 
-/// A zero and a slope that drift with time.
-fn drifts<'a>(bench: &Workbench<'_>, says: Says<'a>) -> [Linear<'a>; 2] {
+/// Currents between which a curve is straight: as far apart in rows, and in amperes, half of each. Nothing where there are too few rows.
+fn knots(x: &[f64]) -> Option<Vec<f64>> {
+    let mut sorted: Vec<f64> = x.iter().copied().filter(|x| x.is_finite()).collect();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let [first, .., last] = sorted.as_slice() else {
+        return None;
+    };
+    let (first, last) = (*first, *last);
+    let place = |at: usize| {
+        let of_rows = at as f64 / sorted.len() as f64;
+        STRETCHES as f64 * 0.5 * (of_rows + (sorted[at] - first) / (last - first))
+    };
+    let (mut knots, mut since) = (vec![first], 0);
+    let mut next = 1.0;
+    for (at, x) in sorted.iter().enumerate() {
+        let are_rows = at - since >= LEAST_ROWS && sorted.len() - at >= LEAST_ROWS;
+        if are_rows && place(at) >= next && *x < last {
+            knots.push(*x);
+            since = at;
+            next = place(at).floor() + 1.0;
+        }
+    }
+    knots.push(last);
+    (knots.len() > 2).then_some(knots)
+}
+
+/// Any curve of the current: straight between some places of it.
+fn curve<'a>(bench: &Workbench<'_>, says: Says<'a>) -> Option<Linear<'a>> {
+    let x = current(bench);
+    let knots = knots(x)?;
+    let mut columns = vec![vec![0.0; x.len()]; knots.len()];
+    for (row, x) in x.iter().enumerate() {
+        let above = knots.partition_point(|knot| knot <= x);
+        let above = above.clamp(1, knots.len() - 1);
+        let [from, to] = [knots[above - 1], knots[above]];
+        let share = ((x - from) / (to - from)).clamp(0.0, 1.0);
+        columns[above - 1][row] = 1.0 - share;
+        columns[above][row] = share;
+    }
+    Some(Linear::new("curve", columns, move |values| {
+        let (of_values, of_knots) = (place_of(values), place_of(&knots));
+        let last = knots.len() - 1;
+        let places = PLACES.min(knots.len());
+        let told = (0..places).map(|place| {
+            let at = place * last / (places - 1);
+            let value = at_place(values[at], of_values);
+            let knot = at_place(knots[at], of_knots);
+            format!("{value} {} at {knot} {}", says.unit, says.of)
+        });
+        let told: Vec<String> = told.collect();
+        format!("a curve of {} alone: {}", says.symbol, told.join(", "))
+    }))
+}
+
+/// A zero, and a slope if it has one, that drift with time.
+fn drifts<'a>(bench: &Workbench<'_>, says: Says<'a>) -> Vec<Linear<'a>> {
     let first_s = bench.t_s.first().copied().unwrap_or_default();
     let since = bench.t_s.iter().map(|t_s| (t_s - first_s) / 3600.0);
     let hours: Vec<f64> = since.collect();
     let x = current(bench);
     let one = vec![1.0; bench.len()];
     let slopes = vec![one.clone(), x.to_vec(), times(x, &hours)];
-    [
-        Linear::new("drift", vec![one, hours], move |values| {
-            format!("a drift of {} {} an hour", signed(values[1]), says.unit)
-        }),
-        Linear::new("slope-drift", slopes, move |values| {
+    let mut drifts = vec![Linear::new("drift", vec![one, hours], move |values| {
+        format!("a drift of {} {} an hour", signed(values[1]), says.unit)
+    })];
+    if says.view != View::StateOfCharge {
+        drifts.push(Linear::new("slope-drift", slopes, move |values| {
             format!("a drift of {} an hour", says.slope(values[2]))
-        }),
-    ]
+        }));
+    }
+    drifts
 }
 
-/// What follows a quantity that was recorded beside: it, its square, and the current times it.
+/// What follows a quantity that was recorded beside: it, its square, and the current times it. Beside a state of charge the current itself
+/// is one.
 fn around<'a>(bench: &'a Workbench<'_>, says: Says<'a>) -> Vec<Linear<'a>> {
-    let around = bench.problem.drive.surroundings();
-    let around: Vec<&str> = around.map(|(name, ..)| name).collect();
-    let variables = variables(bench).into_iter();
-    let all =
-        variables.filter(|v| around.contains(&v.name) && v.values.iter().all(|z| z.is_finite()));
+    let is_charge = says.view == View::StateOfCharge;
+    let all = variables(bench).into_iter().filter(|variable| {
+        let is_beside = match variable.kind {
+            Kind::Beside => true,
+            Kind::Itself => is_charge,
+            _ => false,
+        };
+        is_beside && variable.values.iter().all(|z| z.is_finite())
+    });
     all.flat_map(|variable| {
         let (name, z) = (variable.name, variable.values);
         let mean = z.iter().sum::<f64>() / z.len().max(1) as f64;
@@ -193,7 +275,7 @@ fn around<'a>(bench: &'a Workbench<'_>, says: Says<'a>) -> Vec<Linear<'a>> {
         let units = [(); 3].map(|()| variable.unit.clone());
         let [of_it, of_square, of_slope] = units;
         let unit = says.unit;
-        [
+        let mut around = vec![
             Linear::new("follows", vec![one.clone(), z.clone()], move |values| {
                 format!("{} {unit} per {of_it} of {name}", signed(values[1]))
             }),
@@ -201,10 +283,13 @@ fn around<'a>(bench: &'a Workbench<'_>, says: Says<'a>) -> Vec<Linear<'a>> {
                 let size = signed(values[2]);
                 format!("{size} {unit}/{of_square}² times {name}², beside a straight line")
             }),
-            Linear::new("slope-follows", slopes, move |values| {
+        ];
+        if !is_charge {
+            around.push(Linear::new("slope-follows", slopes, move |values| {
                 format!("{} per {of_slope} of {name}", says.slope(values[3]))
-            }),
-        ]
+            }));
+        }
+        around
     })
     .collect()
 }

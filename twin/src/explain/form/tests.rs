@@ -196,6 +196,33 @@ fn a_memory_is_told_by_its_answer_to_a_step() {
 }
 
 #[test]
+fn a_curve_of_the_current_is_told_by_what_it_is_at_some() {
+    let off_a = |i: f64| 0.4 + 0.7 * (i / 30.0).sin();
+    let form = of(&problem(7, |_, i, e| i + off_a(i) + e)).unwrap();
+    assert_eq!(form.id, "curve", "{form:?}");
+    assert!(form.rmse < 1.2 * NOISE_A, "{form:?}");
+    let told = form
+        .description
+        .strip_prefix("a curve of i alone: ")
+        .unwrap();
+    let mut places = 0;
+    for pair in told.split(", ") {
+        let figures = pair
+            .split(' ')
+            .filter_map(|word| word.replace('−', "-").parse().ok());
+        let figures: Vec<f64> = figures.collect();
+        let [value, at] = figures[..] else {
+            panic!("{pair}");
+        };
+        // At the ends there are a few rows.
+        let most = if at.abs() > 100.0 { 0.4 } else { 0.1 };
+        assert!((value - off_a(at)).abs() < most, "{pair}: {}", off_a(at));
+        places += 1;
+    }
+    assert_eq!(places, 7, "{form:?}");
+}
+
+#[test]
 fn what_follows_another_quantity_is_told_by_its_column() {
     let supply_v: Vec<f64> = (0..ROWS)
         .map(|row| 5.0 + 0.2 * (t_s(row) / 90.0).sin())
