@@ -1,4 +1,6 @@
-//! Spectra of residuals, which are sampled irregularly and have gaps: put on an even grid first, gaps as zero.
+//! Spectra of residuals, which are sampled irregularly and have gaps: put on an even grid first, gaps as zero, long ones shortened.
+
+use std::borrow::Cow;
 
 use rustfft::{FftPlanner, num_complex::Complex};
 
@@ -13,6 +15,12 @@ pub struct Line {
     pub phase_rad: f64,
 }
 
+/// A step of more than this many usual ones, and as many times either neighbour, is a gap: a log that slows down in a rest has none.
+const GAP_STEPS: f64 = 10.0;
+/// Gaps are shortened if they are longer, together, than this many times the rest, …
+const LONG: f64 = 4.0;
+/// … to this many times the rest.
+const SHORTENED: f64 = 2.0;
 /// Longest grid.
 const MOST: usize = 1 << 20;
 /// Frequencies to each side that a line is compared with.
@@ -21,6 +29,50 @@ const NEIGHBOURS: usize = 60;
 const CHANCE: f64 = 1e-3;
 /// Lines that are returned.
 const LINES: usize = 3;
+
+/// Times as they are put on a grid: what is spent on it is to follow the readings, and not the days between two drives. Gaps that
+/// are long beside all readings are shortened, by whole steps, so that readings stay where they are within one. Over such a gap no
+/// line keeps its phase; a fit finds the one it has behind it from the phase ahead of it. A clock that begins anew begins as it does.
+pub fn laid_out(t_s: &[f64], step_s: f64) -> Cow<'_, [f64]> {
+    let steps: Vec<f64> = t_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    let mut usual: Vec<f64> = steps.iter().copied().filter(|step| *step > 0.0).collect();
+    if usual.is_empty() || step_s.is_nan() || step_s <= 0.0 {
+        return t_s.into();
+    }
+    let middle = usual.len() / 2;
+    let usual_s = *usual.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let is_gap = |at: usize| {
+        let beside = at.checked_sub(1).into_iter().chain([at + 1]);
+        let longest_s = beside
+            .filter_map(|at| steps.get(at))
+            .copied()
+            .fold(usual_s, f64::max);
+        steps[at] > GAP_STEPS * longest_s
+    };
+    let (mut covered_s, mut gaps_s, mut gaps) = (0.0, 0.0, 0.0);
+    for (at, step) in steps.iter().enumerate().filter(|(_, step)| **step > 0.0) {
+        if is_gap(at) {
+            gaps_s += step;
+            gaps += 1.0;
+        } else {
+            covered_s += step;
+        }
+    }
+    if gaps_s <= LONG * covered_s {
+        return t_s.into();
+    }
+    let longest_s = SHORTENED * covered_s / gaps;
+    let mut left_out_s = 0.0;
+    let shortened = steps.iter().enumerate().map(|(at, step)| {
+        if *step < 0.0 {
+            left_out_s = 0.0;
+        } else if *step > longest_s && is_gap(at) {
+            left_out_s += ((step - longest_s) / step_s).ceil() * step_s;
+        }
+        t_s[at + 1] - left_out_s
+    });
+    t_s.iter().copied().take(1).chain(shortened).collect()
+}
 
 fn grid(t_s: &[f64], values: &[f64], step_s: f64) -> Option<(Vec<Complex<f64>>, f64, usize)> {
     let (first, last) = (*t_s.first()?, *t_s.last()?);
@@ -53,6 +105,7 @@ fn grid(t_s: &[f64], values: &[f64], step_s: f64) -> Option<(Vec<Complex<f64>>, 
 
 /// Lines that stand out of the spectrum around them by more than chance makes of noise.
 pub fn lines(t_s: &[f64], values: &[f64], step_s: f64) -> Vec<Line> {
+    let t_s = &*laid_out(t_s, step_s);
     let Some((mut grid, _, filled)) = grid(t_s, values, step_s) else {
         return Vec::new();
     };
@@ -136,7 +189,7 @@ pub fn lines(t_s: &[f64], values: &[f64], step_s: f64) -> Vec<Line> {
         .collect()
 }
 
-/// Frequencies in Hz of the strongest peaks, strongest first, whether they stand out or not.
+/// Frequencies in Hz of the strongest peaks, strongest first, whether they stand out or not; times are put on a grid as they are.
 pub fn strongest(t_s: &[f64], values: &[f64], step_s: f64, count: usize) -> Vec<f64> {
     let Some((mut grid, _, _)) = grid(t_s, values, step_s) else {
         return Vec::new();
@@ -168,6 +221,7 @@ pub fn strongest(t_s: &[f64], values: &[f64], step_s: f64, count: usize) -> Vec<
 
 /// Amplitude spectral density in `bands` bands of equal width on a logarithmic axis: lower and upper end in Hz, and unit/√Hz.
 pub fn density(t_s: &[f64], values: &[f64], step_s: f64, bands: usize) -> Vec<(f64, f64, f64)> {
+    let t_s = &*laid_out(t_s, step_s);
     let Some((mut grid, _, filled)) = grid(t_s, values, step_s) else {
         return Vec::new();
     };
@@ -223,5 +277,44 @@ mod tests {
         assert!((found[0].frequency_hz - 1.237).abs() < 1e-3);
         assert!((found[0].amplitude - 0.5).abs() < 0.1);
         assert!((found[0].phase_rad - 0.7).abs() < 1.0);
+    }
+
+    #[test]
+    fn a_log_that_slows_down_is_laid_out_as_it_is() {
+        let slow = (0..300).map(|k| 300.0 + 60.0 * f64::from(k));
+        let t_s: Vec<f64> = (0..3000).map(|k| f64::from(k) * 0.1).chain(slow).collect();
+        assert_eq!(laid_out(&t_s, 0.1), t_s);
+    }
+
+    #[test]
+    fn days_between_two_drives_are_not_laid_out() {
+        let drive = (0..3000).map(|k| f64::from(k) * 0.1);
+        // Less than four times their length apart, both are where they were.
+        for (gap_s, as_read) in [
+            (900.0, true),
+            (3.0 * 86_400.0, false),
+            (90.0 * 86_400.0, false),
+        ] {
+            let again = drive.clone().map(|t| t + 300.0 + gap_s);
+            let t_s: Vec<f64> = drive.clone().chain(again).collect();
+            let hum: Vec<f64> = t_s
+                .iter()
+                .map(|t| 0.5 * (std::f64::consts::TAU * 1.237 * t + 0.7).sin())
+                .collect();
+            let bands = density(&t_s, &hum, 0.1, 16);
+            let (lowest_hz, ..) = *bands.first().expect("a spectrum");
+            // The grid is as long as one over its lowest frequency.
+            assert!(lowest_hz > 1.0 / 3000.0, "{gap_s} s: {lowest_hz} Hz");
+            assert_eq!(laid_out(&t_s, 0.1) == t_s, as_read, "{gap_s} s");
+            let found = lines(&t_s, &hum, 0.1);
+            assert!(
+                (found[0].frequency_hz - 1.237).abs() < 1e-3,
+                "{gap_s} s: {found:?}"
+            );
+            assert!(
+                (found[0].amplitude - 0.5).abs() < 0.1,
+                "{gap_s} s: {found:?}"
+            );
+        }
     }
 }

@@ -1,5 +1,7 @@
 //! Only a part of each period is measured.
 
+use std::borrow::Cow;
+
 use super::between::Converter;
 use super::scene::{Scale, Scene};
 use crate::spectrum;
@@ -16,6 +18,8 @@ const UPDATES: usize = 6;
 const BEST: usize = 6;
 /// Added and taken away again, it leaves a number rounded: in lanes, as no conversion to an integer is.
 const WHOLE: f64 = 1.5 * (1u64 << 52) as f64;
+/// Cells of a grid that are followed over gaps of any length: windows keep their turn over some hours, and lines of their beat with them.
+const CELLS: f64 = (1 << 18) as f64;
 /// Cycles that the age of a reading goes through in a recording at least: with fewer it is a delay.
 const CYCLES: f64 = 6.0;
 
@@ -166,6 +170,14 @@ fn turns(frequency_hz: f64, series: impl Iterator<Item = (f64, f64)>) -> f64 {
     f64::atan2(sine, cosine) / std::f64::consts::TAU
 }
 
+/// Times as beats and rates of updates are looked for in.
+fn laid_out(t_s: &[f64], step_s: f64) -> Cow<'_, [f64]> {
+    match t_s {
+        [first, .., last] if last - first > CELLS * step_s => spectrum::laid_out(t_s, step_s),
+        _ => t_s.into(),
+    }
+}
+
 /// Rates in Hz at which readings move, and when they first do, in s from the first reading: a held one moves at one phase of each
 /// period only, however the current moves.
 fn updates(clues: &Clues<'_>, scale: &Scale) -> Vec<(f64, f64)> {
@@ -182,11 +194,12 @@ fn updates(clues: &Clues<'_>, scale: &Scale) -> Vec<(f64, f64)> {
         .zip(&simulated)
         .map(|(seen, simulated)| seen - share * simulated)
         .collect();
-    spectrum::strongest(clues.t_s, &beyond, scale.spectral_step_s, UPDATES)
+    let t_s = laid_out(clues.t_s, scale.spectral_step_s);
+    spectrum::strongest(&t_s, &beyond, scale.spectral_step_s, UPDATES)
         .into_iter()
         .filter(|frequency_hz| *frequency_hz > 0.0)
         .map(|frequency_hz| {
-            let times = clues.t_s.iter().map(|t| t - clues.t_s[0]);
+            let times = t_s.iter().map(|t| t - t_s[0]);
             // It is between two readings.
             let turns = turns(frequency_hz, times.zip(beyond.iter().copied()));
             (
@@ -252,6 +265,13 @@ fn by_age(clues: &Clues<'_>, scale: &Scale) -> Vec<Vec<f64>> {
         return Vec::new();
     }
     let late_s = product(&off, &rate) / all;
+    // Beats are followed without the days between two drives, as lines are.
+    let shortened = laid_out(&t_s, step);
+    let left_out_s = match (t_s.last(), shortened.last()) {
+        (Some(t), Some(shortened)) => t - shortened,
+        _ => 0.0,
+    };
+    let (t_s, span) = (shortened, span - left_out_s);
     let course: Vec<f64> = off
         .iter()
         .zip(&rate)
