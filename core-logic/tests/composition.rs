@@ -2016,16 +2016,26 @@ fn what_a_single_sensor_may_leave_uncounted_is_doubted() {
     assert!((7_980..8_050).contains(&d2), "{d2} ppm");
 }
 
-/// They are of the sensor that was there.
+/// They are of the sensor that was there, or of its full scale.
 #[test]
-fn another_front_end_comes_without_zero_drift_and_key_factors() {
+fn another_front_end_comes_without_what_was_found_of_the_one_before() {
     let mut configuration = Configuration::default();
     let value = PerRange {
         small: Microamps(800_000),
         large: Microamps(-3_000_000),
     };
+    let gain = PerRange {
+        small: Ppm(12_000),
+        large: Ppm(-30_000),
+    };
     configuration.zero_drift.value = value;
     configuration.key_factors.a = Microvolts(10_000);
+    configuration.current_gain = gain;
+    configuration.meter.gain = gain;
+    configuration.meter.offset = value;
+    // The board's own.
+    configuration.meter.reference_error = Ppm(500);
+    configuration.meter.divider_error = Ppm(-700);
     let before = configuration;
     let front_end = FIELDS.iter().find(|field| field.layout.address == 0x0100);
     front_end.unwrap().put(&mut configuration, 0, 0).unwrap();
@@ -2033,6 +2043,12 @@ fn another_front_end_comes_without_zero_drift_and_key_factors() {
     front_end.unwrap().put(&mut configuration, 0, 1).unwrap();
     let found = (configuration.zero_drift.value, configuration.key_factors);
     assert_eq!(found, (PerRange::both(Microamps::ZERO), KeyFactors::NONE));
+    let meter = &configuration.meter;
+    let gains = (configuration.current_gain, meter.gain, meter.offset);
+    let none = PerRange::both(Ppm::ZERO);
+    assert_eq!(gains, (none, none, PerRange::both(Microamps::ZERO)));
+    let board = (meter.reference_error, meter.divider_error);
+    assert_eq!(board, (Ppm(500), Ppm(-700)));
 }
 
 /// A gap shorter than what lies between two conversions would leave the average without a reading in each of them.

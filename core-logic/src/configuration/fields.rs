@@ -95,8 +95,8 @@ impl Field {
         }
     }
 
-    /// Sets an element, if `value` is in the limits and the element in use. Another front end comes without the zero drift and the key
-    /// factors, which are the old one's.
+    /// Sets an element, if `value` is in the limits and the element in use. Another front end comes without the zero drift, the key
+    /// factors and the gains, which are the old one's, and without the meter's offset, found in amperes of its full scale.
     ///
     /// # Errors
     /// Why it was not set.
@@ -113,6 +113,9 @@ impl Field {
         {
             if mem::discriminant(&configuration.front_end) != front_end {
                 configuration.forget_zero();
+                configuration.current_gain = PerRange::both(Ppm::ZERO);
+                configuration.meter.gain = PerRange::both(Ppm::ZERO);
+                configuration.meter.offset = PerRange::both(Microamps::ZERO);
             }
             configuration.derive();
             Ok(())
@@ -352,7 +355,7 @@ const FULL_SCALE: (i32, i32) = (
 );
 
 fields! {
-    0x0100 U16 1 Standstill (0, 3) "front end" "" "0 dual range (D0), 1 HAH1BV (D2), 2 network (D3), 3 closed loop (D4); another one than before comes with its defaults, and without the zero drift and key factors of the old one" [at front_end];
+    0x0100 U16 1 Standstill (0, 3) "front end" "" "0 dual range (D0), 1 HAH1BV (D2), 2 network (D3), 3 closed loop (D4); another one than before comes with its defaults, and without the old one's zero drift, key factors, current gain, and gain and offset of the meter" [at front_end];
     0x0102 I32 2 Standstill (FULL_SCALE.0, FULL_SCALE.1) "dual range: full scale" "µA" "small and large sensor" [sensor_ranges DualRange full_scale];
     0x0106 I32 1 Standstill (1_000_000, 2_500_000) "dual range: swing" "µV" "output from 0 A to the end of the range" [sensor DualRange swing];
     0x0108 I32 1 Standstill (1_000_000, 4_000_000) "dual range: zero" "µV" "output at 0 A" [sensor DualRange zero];
