@@ -388,6 +388,11 @@ impl ConverterCoefficients {
         self.configuration
     }
 
+    /// Whether a sample reads the same by `other`, but for the channel that it comes from.
+    pub(crate) fn reads_like(&self, other: &Self) -> bool {
+        self.ranges == other.ranges
+    }
+
     /// The sensor's supply that the current is worked out with, [`FrontEnd::line`]'s.
     #[must_use]
     pub const fn supply(&self) -> Microvolts {

@@ -596,8 +596,8 @@ impl Measurement {
         measurement
     }
 
-    /// The active configuration is another one: factors are worked out anew, nothing measured is lost. The meter's
-    /// owner has to be handed [`Measurement::meter_config`] as well.
+    /// The active configuration is another one: factors are worked out anew, nothing measured is lost but an average of
+    /// what would read otherwise now. The meter's owner has to be handed [`Measurement::meter_config`] as well.
     pub fn configuration_changed(&mut self, configuration: &Configuration) {
         let converter = self.prepared.converter;
         if self.key_factors_set != configuration.key_factors {
@@ -671,6 +671,7 @@ impl Measurement {
         now: Instant,
     ) {
         self.basis_number = self.basis_number.wrapping_add(1);
+        let converter = self.prepared.converter;
         self.prepared = prepare(
             configuration,
             &Basis {
@@ -681,6 +682,10 @@ impl Measurement {
         );
         self.meter_calibration_due = true;
         if anew {
+            // What it holds was read by another sensor's scale, or with another correction.
+            if !converter.reads_like(&self.prepared.converter) {
+                self.average.clear();
+            }
             let at = meter_follows(now);
             self.converter.forget_meter_until(at);
             self.compare.restart_at(at);

@@ -6,6 +6,8 @@
 //! - **Gap.** When no valid reading came for longer than [`SlidingAverageConfig::max_gap_ms`], what is stored describes
 //!   another time: the average is empty until a valid reading starts it anew.
 //! - **Fault.** Readings that looked sound and were none are in it when a fault is found: its owner empties it when that ends.
+//! - **Other sensor or correction.** What was read by the one before is not of this one: its owner empties it here too. Another supply
+//!   is followed without that.
 //! - **Range change.** Currents are amperes whichever sensor gave them, so the window spans a range change; the
 //!   readings around the edge are invalid and stay out.
 

@@ -2051,6 +2051,54 @@ fn another_front_end_comes_without_what_was_found_of_the_one_before() {
     assert_eq!(board, (Ppm(500), Ppm(-700)));
 }
 
+/// 100 A of the HAH1BV, whose 2.9 V were 10.67 A of the small sensor; a zero drift of 5 A; and factors of a key cycle. Nothing valid has
+/// something of before in it; a setting that has no part in the current leaves the average alone.
+#[test]
+fn the_average_holds_nothing_that_was_read_by_another_sensor_or_correction() {
+    let mut configuration = Configuration::default();
+    configuration.average.length = 64;
+    let mut bench = Bench::new(configuration);
+    // 2.9 V of 5 V.
+    bench.code = 4_751;
+    bench.report.mean_current = Microamps(10_666_667);
+    bench.count_ms(3_000);
+    let average = |bench: &Bench| bench.measurement.current_average(&bench.configuration);
+    assert_eq!(average(&bench).validity, Validity::VALID);
+    let follows = |bench: &mut Bench, amps: i32| {
+        bench
+            .measurement
+            .configuration_changed(&bench.configuration);
+        bench.report.mean_current = Microamps::from_amps(amps);
+        let mut waited_ms = 0;
+        for since_ms in (0..3_000).step_by(10) {
+            let average = average(bench);
+            let off = average.average.saturating_sub(Microamps::from_amps(amps));
+            assert!(
+                !average.validity.is_valid() || off.saturating_abs() < Microamps(200_000),
+                "{amps} A, {since_ms} ms: {average:?}"
+            );
+            waited_ms += if average.validity.is_valid() { 0 } else { 10 };
+            bench.count_ms(10);
+        }
+        // Until the next conversion.
+        assert!(waited_ms <= 40, "{waited_ms} ms");
+    };
+    bench.configuration = with_front_end(FrontEnd::Hah1bv(Hah1bv::default()));
+    bench.configuration.average.length = 64;
+    follows(&mut bench, 100);
+    bench.configuration.zero_drift.value = PerRange::both(Microamps::from_amps(5));
+    follows(&mut bench, 95);
+    bench.configuration.key_factors.a = Microvolts::from_millivolts(40);
+    follows(&mut bench, 105);
+    bench.configuration.soc.capacity_mah += 1;
+    bench.configuration.converter.stale_after_periods += 1;
+    bench
+        .measurement
+        .configuration_changed(&bench.configuration);
+    let average = average(&bench);
+    assert_eq!((average.validity, average.samples), (Validity::VALID, 64));
+}
+
 /// A gap shorter than what lies between two conversions would leave the average without a reading in each of them.
 #[test]
 fn the_averages_gap_is_longer_than_two_conversions() {
