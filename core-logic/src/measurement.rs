@@ -1697,7 +1697,8 @@ impl Measurement {
         readings.meter_current = self.meter.mean_current;
         readings.current_validity = self.current_validity(self.reading.validity);
         readings.average_validity = average_validity;
-        readings.charge_validity = self.mean_validity();
+        readings.meter_validity = self.mean_validity();
+        readings.charge_validity = self.charge_validity();
         readings.conversions = self.conversions;
         readings.sensor_voltage = self.reading.volts;
         readings.range = self.history.range;

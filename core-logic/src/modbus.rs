@@ -700,7 +700,7 @@ mod tests {
             meter_current = Microamps(1_000_000) => [0x0044, 0x0056];
             current_validity = bad => [0x0046];
             average_validity = bad => [0x0047];
-            charge_validity = bad => [0x0048];
+            meter_validity = bad => [0x0048];
             range = crate::range::Range::Large => [0x0049];
             conversions = 1 => [0x004A];
             sensor_voltage = Microvolts(1) => [0x004C];
@@ -714,6 +714,7 @@ mod tests {
             channel_difference = Nanocoulombs(1_000_000) => [0x0070];
             channel_bound = Nanocoulombs(1_000_000) => [0x0074];
             estimated_intervals = 1 => [0x0078];
+            charge_validity = bad => [0x007A];
             soc = Ppm(1) => [0x0080];
             soc_uncertainty = Ppm(1) => [0x0082];
             soc_validity = bad => [0x0084];

@@ -1782,7 +1782,7 @@ fn no_mean_that_has_something_of_a_fault_in_it_is_valid() {
         for (mean, validity) in [
             (average.average, average.validity),
             (meter.current, meter.validity),
-            (on_modbus.meter_current, on_modbus.charge_validity),
+            (on_modbus.meter_current, on_modbus.meter_validity),
         ] {
             let off = mean.saturating_sub(Microamps::from_amps(30));
             assert!(
@@ -1795,6 +1795,38 @@ fn no_mean_that_has_something_of_a_fault_in_it_is_valid() {
     assert_eq!((average.validity, average.samples), (Validity::VALID, 64));
     let meter = bench.measurement.meter_current();
     assert_eq!(meter.validity, Validity::VALID);
+}
+
+/// A sensor that was beyond its range is right again 100 ms later; the meter's mean has something of that in it for the second of its
+/// window. The mean's register waits, the charge's does not.
+#[test]
+fn the_charge_on_modbus_is_valid_as_soon_as_on_can() {
+    let mut bench = Bench::new(with_front_end(FrontEnd::Hah1bv(Hah1bv::default())));
+    bench.run_ms(1_000);
+    bench.code = 7_500;
+    bench.report.mean_current = Microamps::from_amps(500);
+    bench.count_ms(2_000);
+    assert!(bench.has(Code::SensorSaturated));
+    bench.code = 4_096;
+    bench.report.mean_current = Microamps::ZERO;
+    let mut valid_after_ms = [None; 2];
+    for since_ms in (0..3_000_u64).step_by(10) {
+        let begun = bench.now.saturating_sub(1_000_000);
+        bench.mean = Some((Microamps::ZERO, Instant::from_ticks(begun)));
+        bench.count_ms(10);
+        let readings = bench.readings();
+        let on_can = bench.measurement.charge().validity;
+        assert_eq!(readings.charge_validity, on_can, "{since_ms} ms");
+        let validities = [readings.charge_validity, readings.meter_validity];
+        for (after_ms, validity) in valid_after_ms.iter_mut().zip(validities) {
+            if validity.is_valid() {
+                after_ms.get_or_insert(since_ms);
+            }
+        }
+    }
+    let [charge, meter] = valid_after_ms.map(Option::unwrap);
+    assert!(charge <= 200, "{charge} ms");
+    assert!((1_000..1_200).contains(&meter), "{meter} ms");
 }
 
 /// A large sensor of 1,800 A, whose output at 0 A is as much as 2,000 A.

@@ -17,7 +17,7 @@ use serve_support::{FakeBoard, Fault, Running, options};
 /// Reads the map version: the example of a request in *MODBUS over Serial Line*, with this map's address. Its CRC and that
 /// of the answer by an independent calculation.
 const REQUEST: [u8; 8] = [0x01, 0x04, 0x00, 0x00, 0x00, 0x01, 0x31, 0xCA];
-const ANSWER: [u8; 7] = [0x01, 0x04, 0x02, 0x02, 0x00, 0xB8, 0x50];
+const ANSWER: [u8; 7] = [0x01, 0x04, 0x02, 0x02, 0x01, 0x79, 0x90];
 
 fn tcp(running: &Running) -> TcpStream {
     let stream = TcpStream::connect(("127.0.0.1", running.rs485_port)).unwrap();

@@ -6,7 +6,7 @@ use crate::units::{Microamps, Microvolts, MilliCelsius, Millivolts, Nanocoulombs
 use crate::validity::Validity;
 
 /// Version of the register map: the upper byte counts incompatible changes, the lower one additions.
-pub const MAP_VERSION: u16 = 0x0200;
+pub const MAP_VERSION: u16 = 0x0201;
 
 /// The calibration under way.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -107,8 +107,8 @@ readings! {
     current_validity: Validity,
     /// Why the averaged current is not valid.
     average_validity: Validity,
-    /// Why the meter's charge and current are not valid.
-    charge_validity: Validity,
+    /// Why the meter's charge and mean current are not both valid.
+    meter_validity: Validity,
     /// Counts the conversions, so that a repetition is visible.
     conversions: u32,
     /// Output of the selected sensor.
@@ -124,6 +124,8 @@ readings! {
 
     /// Net charge, positive is discharge.
     charge: Nanocoulombs,
+    /// Why it is not valid.
+    charge_validity: Validity,
     /// Charge that flowed in.
     charge_in: Nanocoulombs,
     /// Charge that flowed out.
@@ -309,7 +311,7 @@ inputs! {
     0x0044 I32 1 "meter current" "mA" "mean by the meter" |r, _| r.meter_current.to_milliamps().into();
     0x0046 U16 1 "current validity" "bits" "causes, see below; 0 is valid" |r, _| validity(r.current_validity);
     0x0047 U16 1 "average validity" "bits" "of the averaged current" |r, _| validity(r.average_validity);
-    0x0048 U16 1 "charge validity" "bits" "of the meter's charge and current" |r, _| validity(r.charge_validity);
+    0x0048 U16 1 "meter validity" "bits" "of the meter's charge and current: after a fault until its mean has nothing of it" |r, _| validity(r.meter_validity);
     0x0049 U16 1 "range" "" "0 small sensor, 1 large sensor" |r, _| r.range as i64;
     0x004A U32 1 "conversions" "" "counts the conversions, so that a repetition is visible" |r, _| r.conversions.into();
     0x004C I32 1 "sensor voltage" "µV" "output of the selected sensor" |r, _| r.sensor_voltage.get().into();
@@ -327,6 +329,7 @@ inputs! {
     0x0070 I64 1 "channel difference" "mC" "meter less converter over the last slow window; 0 if that was undecided" |r, _| mc(r.channel_difference);
     0x0074 I64 1 "channel bound" "mC" "what they may differ by" |r, _| mc(r.channel_bound);
     0x0078 U32 1 "estimated intervals" "" "meter intervals whose split between the ranges was estimated" |r, _| r.estimated_intervals.into();
+    0x007A U16 1 "charge validity" "bits" "of the charge alone, as on CAN" |r, _| validity(r.charge_validity);
 
     // State of charge.
     0x0080 I32 1 "state of charge" "ppm" "1,000,000 is full" |r, _| r.soc.get().into();
