@@ -440,6 +440,34 @@ fn a_closed_loop_sensor_without_relations_says_so() {
     assert!(!bench.has(Code::SupplyCalibrationInvalid));
 }
 
+/// What flows while nobody knows what the output stands for is within the meter's full scale, here 2.25 V of 6.67 mV/A, and no less is known:
+/// the bound grows until the relations are there, and no further.
+#[test]
+fn without_relations_whatever_may_have_flowed_is_declared() {
+    let mut bench = Bench::new(with_front_end(FrontEnd::ClosedLoop(ClosedLoop::default())));
+    bench.run_ms(1_000);
+    let declared = |bench: &Bench| bench.readings().charge_uncertainty;
+    let before = declared(&bench);
+    bench.run_ms(10_000);
+    let grown = declared(&bench).saturating_sub(before);
+    let off = grown.saturating_sub(Nanocoulombs::from_coulombs(3_375));
+    // A conversion more or less.
+    assert!(
+        off.saturating_abs() < Nanocoulombs::from_coulombs(12),
+        "{grown:?}"
+    );
+    assert!(!bench.readings().charge_validity.is_valid());
+    Found::SupplyRelations(closed_loop().relations).store(&mut bench.configuration);
+    bench
+        .measurement
+        .configuration_changed(&bench.configuration);
+    bench.run_ms(100);
+    let before = declared(&bench);
+    bench.run_ms(10_000);
+    assert_eq!(declared(&bench), before);
+    assert!(!bench.has(Code::SupplyCalibrationInvalid));
+}
+
 /// D4 by order of a host: points over the supply at 0 A and at the test current, then the relations.
 /// Seven supplies at 0 A and at 200 A, each taken as a point; `reference_v` is the converter's at a supply.
 fn sweep_supply(bench: &mut Bench, truth: &FrontEnd, reference_v: impl Fn(Microvolts) -> f64) {
