@@ -1329,6 +1329,7 @@ impl Measurement {
         ZeroConditions {
             high_voltage_is_off: self.is_at_rest(),
             meter_mean: self.meter_mean(),
+            noisy: self.prepared.converter.channel() == Channel::Adc1,
         }
     }
 

@@ -722,6 +722,122 @@ fn a_zero_calibration_reports_progress_ends_and_can_be_aborted() {
 }
 
 /// The command of a key-state calibration ends with the key cycle that it waits for.
+/// D3 at rest, as `firmware/src/analog.rs` reads it with `codes` of noise, rms, in each conversion: four of the network to a reading, and a
+/// mean over 16 of the reference, of which every second tick has one.
+struct NoisyNetwork {
+    codes: f64,
+    state: u64,
+    reference: f64,
+    odd: bool,
+}
+
+impl NoisyNetwork {
+    const REFERENCE: f64 = 1.21 / 3.3 * 4_096.0;
+
+    fn new(codes: f64, seed: u64) -> Self {
+        Self {
+            codes,
+            state: seed,
+            reference: Self::REFERENCE,
+            odd: false,
+        }
+    }
+
+    /// Twelve uniform ones are a normal one.
+    fn noise(&mut self) -> f64 {
+        let sum = (0..12).fold(-6.0, |sum, _| {
+            self.state ^= self.state << 13;
+            self.state ^= self.state >> 7;
+            self.state ^= self.state << 17;
+            sum + (self.state >> 11) as f64 / (1_u64 << 53) as f64
+        });
+        self.codes * sum
+    }
+
+    /// The network's output at `amps` of 8 mV each at the Hall output.
+    fn output(&mut self, amps: f64) -> Microvolts {
+        self.odd = !self.odd;
+        if self.odd {
+            let newest = (Self::REFERENCE + self.noise()).round();
+            self.reference += (newest - self.reference) / 16.0;
+        }
+        let code = (NETWORK_ZERO_V + 0.225 * 8e-3 * amps) / 3.3 * 4_096.0;
+        let sum: f64 = (0..4).map(|_| (code + self.noise()).round()).sum();
+        Microvolts((sum / 4.0 / 4_096.0 * 3.3e6 * Self::REFERENCE / self.reference) as i32)
+    }
+}
+
+/// "zero now" while `amps` flow, after the number of the reading from the order on.
+fn zero_of_network(
+    network: &mut NoisyNetwork,
+    amps: impl Fn(usize) -> f64,
+) -> Result<Microamps, u16> {
+    let mut configuration = with_front_end(FrontEnd::Network(Network::default()));
+    configuration.key_calibration.enabled = false;
+    let mut bench = Bench::new(configuration);
+    bench.next_conversion = u64::MAX;
+    for _ in 0..50 {
+        bench.environment.network = Some(network.output(0.0));
+        bench.run_ms(10);
+    }
+    assert_eq!(bench.order(Order::ZeroNow), Ok(()));
+    for number in 0.. {
+        bench.environment.network = Some(network.output(amps(number)));
+        bench.run_ms(10);
+        let readings = bench.readings();
+        match readings.command_state {
+            CommandState::Running => {}
+            CommandState::Done => {
+                // What it takes with the shortest quarters, and one reading until it is in force.
+                assert!((63..=65).contains(&number), "{number}");
+                return Ok(bench.configuration.zero_drift.value.small);
+            }
+            _ => return Err(readings.command_reason),
+        }
+    }
+    unreachable!()
+}
+
+/// By the factory's limit of 0.5 A, of which such noise alone makes twice as much between single readings.
+#[test]
+fn a_noisy_network_s_zero_is_taken_and_a_current_that_moves_is_refused() {
+    let mut network = NoisyNetwork::new(1.0, 0x9E37_79B9_7F4A_7C15);
+    let mut refused = 0;
+    for _ in 0..300 {
+        match zero_of_network(&mut network, |_| 0.0) {
+            // Noise of 0.25 A in 64 readings, and of the reference what is alike in all.
+            Ok(zero) => assert!(zero.saturating_abs() < Microamps(400_000), "{zero:?}"),
+            Err(reason) => {
+                assert_eq!(reason, Refusal::Unstable as u16);
+                refused += 1;
+            }
+        }
+    }
+    assert!(refused <= 6, "{refused} of 300");
+    let currents: [(&str, fn(usize) -> f64); 5] = [
+        ("from the half on", |n| if n < 32 { 0.0 } else { 1.2 }),
+        ("in the last quarter", |n| if n < 48 { 0.0 } else { -1.2 }),
+        ("a ramp", |n| n as f64 / 64.0 * 2.0),
+        (
+            "20 A at rest, a relay",
+            |n| {
+                if n % 16 < 2 { 20.0 } else { 0.0 }
+            },
+        ),
+        ("one reading", |n| if n == 63 { 4.0 } else { 0.0 }),
+    ];
+    for (name, amps) in currents {
+        let taken = (0..100).filter(|_| zero_of_network(&mut network, amps).is_ok());
+        assert_eq!(taken.count(), 0, "{name}");
+    }
+    // Without noise, what the limit says.
+    let mut quiet = NoisyNetwork::new(0.0, 1);
+    for (amps, is_refused) in [(0.4, false), (0.7, true)] {
+        let zero = zero_of_network(&mut quiet, |n| if n < 32 { 0.0 } else { amps });
+        assert_eq!(zero.is_err(), is_refused, "{amps} A: {zero:?}");
+    }
+}
+
 #[test]
 fn an_ordered_key_calibration_ends_as_done_or_failed() {
     let mut bench = Bench::new(Configuration::default());

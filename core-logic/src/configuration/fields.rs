@@ -388,7 +388,7 @@ fields! {
     0x0300 I32 2 Standstill (-50_000_000, 50_000_000) "zero drift" "µA" "what the sensor reads at 0 A, subtracted; small, large sensor" [ranges zero_drift.value];
     0x0304 I32 2 Standstill (1, 50_000_000) "zero drift: limit" "µA" "largest magnitude accepted; small, large sensor" [ranges zero_drift.limit];
     0x0308 U16 1 Standstill (zero_drift::SAMPLE_LIMITS.0, zero_drift::SAMPLE_LIMITS.1) "zero drift: samples" "" "valid readings that `zero now` takes" [at zero_drift.samples];
-    0x030A I32 2 Standstill (1, 50_000_000) "zero drift: spread" "µA" "largest distance between them; small, large sensor" [ranges zero_drift.max_spread];
+    0x030A I32 2 Standstill (1, 50_000_000) "zero drift: spread" "µA" "largest distance between them; with the network (D3), whose noise is larger, between the means of the run's quarters, and four times as much between readings; small, large sensor" [ranges zero_drift.max_spread];
     0x030E I32 2 Standstill (1, 50_000_000) "zero drift: meter mean" "µA" "largest mean of the meter at which no current may flow; small, large sensor" [ranges zero_drift.max_meter_mean];
     0x0312 U32 1 Standstill (100, 600_000) "zero drift: timeout" "ms" "longest time that `zero now` takes" [at zero_drift.timeout_ms];
     0x0320 U16 1 Always (sliding_average::LENGTH_LIMITS.0, sliding_average::LENGTH_LIMITS.1) "average: length" "readings" "of the sliding average" [at average.length];
