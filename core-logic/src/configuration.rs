@@ -997,6 +997,30 @@ mod tests {
         }
     }
 
+    /// The limits of this firmware count, whatever one before has let through and saved: a record is judged when it is read, at the start and
+    /// by `restore`.
+    #[test]
+    fn a_stored_interval_that_wears_the_flash_out_is_refused() {
+        let interval = |nanocoulombs| {
+            let mut configuration = Configuration::default();
+            configuration.save_policy.charge_interval = crate::units::Nanocoulombs(nanocoulombs);
+            decode(&record(&configuration)).map(|read| assert_eq!(read, configuration))
+        };
+        assert_eq!(interval(30_000_000_000), Ok(()));
+        for value in [1_000_000_000, 29_999_999_999] {
+            let refused = Violation::OutOfLimits {
+                field: FieldId {
+                    address: 0x0840,
+                    element: 0,
+                },
+                value,
+                min: 30_000_000_000,
+                max: 100_000_000_000_000,
+            };
+            assert_eq!(interval(value), Err(ConfigurationError::Invalid(refused)));
+        }
+    }
+
     #[test]
     fn what_is_repeated_follows_its_origin() {
         let mut configuration = Configuration::default();

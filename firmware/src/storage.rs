@@ -16,6 +16,7 @@ use core::ops::Range;
 
 use core_logic::{
     configuration::{self, Configuration, ConfigurationError, MAX_RECORD},
+    design_parameters as design,
     retained::{LogRecord, MAX_LOG_BYTES, MAX_STATE_BYTES, RetainedState},
 };
 use embedded_storage_async::nor_flash::NorFlash;
@@ -41,6 +42,8 @@ type Chip = Flash<spi::Device<SPI2, PB12<Output>>>;
 const CONFIGURATION: Range<u32> = 0x00_0000..0x00_4000;
 const STATE: Range<u32> = 0x01_0000..0x02_0000;
 const LOG: Range<u32> = 0x20_0000..0x40_0000;
+// The smallest intervals of saving are worked out by it.
+const _: () = assert!((STATE.end - STATE.start) as i64 == design::STATE_FLASH_BYTES);
 
 /// So much of the log is looked through in one turn: 32 sectors, 0.2 ms.
 const LOOKED_AT: u32 = 32 * SECTOR;

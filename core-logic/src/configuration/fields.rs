@@ -10,7 +10,9 @@ use crate::modbus::register::{Kind, Layout, Row};
 use crate::ocv::MAX_POINTS;
 use crate::soc::CAPACITY_LIMITS_MAH;
 use crate::units::{Microamps, Microvolts, MilliCelsius, Millivolts, Nanocoulombs, Ppm, clamp_i32};
-use crate::{converter, key_calibration, sliding_average, supply_calibration, zero_drift};
+use crate::{
+    converter, key_calibration, retained, sliding_average, supply_calibration, zero_drift,
+};
 
 /// The state of the board in which a setting may be written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -471,8 +473,8 @@ fields! {
     0x0804 U32 1 Always (0, 10_000) "open sensor: set time" "ms" "from the first to the last of the faulty ones" [at open_sensor.set_time_ms];
     0x0806 U32 1 Always (0, 10_000) "open sensor: clear time" "ms" "from the first to the last of the good ones" [at open_sensor.clear_time_ms];
     0x0808 I32 2 Always (-55_000, 150_000) "temperature limits" "m°C" "lowest and highest of sensors and board, beyond which it is reported" [list temperature_limits];
-    0x0840 I64 1 Always (1_000_000_000i64, 100_000_000_000_000i64) "save: charge interval" "nC" "change of the charge counter after which it is written to flash" [at save_policy.charge_interval];
-    0x0844 U32 1 Always (10, 86_400) "save: time interval" "s" "after which the state is written to flash, whatever has changed" [at save_policy.time_interval_s];
+    0x0840 I64 1 Always (retained::MIN_CHARGE_INTERVAL.get(), 100_000_000_000_000i64) "save: charge interval" "nC" "change of the charge counter after which it is written to flash; less would wear the flash out in a vehicle's life" [at save_policy.charge_interval];
+    0x0844 U32 1 Always (retained::MIN_TIME_INTERVAL_S, 86_400) "save: time interval" "s" "after which the state is written to flash, whatever has changed" [at save_policy.time_interval_s];
 
     0x0900 U16 1 Always (1, 247) "Modbus address" "" "answers from the next request on" [at rtu.address];
     0x0901 U16 1 Always (0, 50_000) "turnaround" "µs" "silence before an answer, at least the 1,750 µs that end a request" [at rtu.turnaround_us];
