@@ -345,7 +345,7 @@ fn take(
     if spread.get() > max_spread.get().saturating_mul(spreads) {
         return Some(Err(ZeroRefusal::Unstable { spread }));
     }
-    if run.taken % part != 0 {
+    if !run.taken.is_multiple_of(part) {
         return None;
     }
     let of_part = run.sum - core::mem::replace(&mut run.parts_sum, run.sum);

@@ -814,7 +814,8 @@ fn a_noisy_network_s_zero_is_taken_and_a_current_that_moves_is_refused() {
         }
     }
     assert!(refused <= 6, "{refused} of 300");
-    let currents: [(&str, fn(usize) -> f64); 5] = [
+    type Current = (&'static str, fn(usize) -> f64);
+    let currents: [Current; 5] = [
         ("from the half on", |n| if n < 32 { 0.0 } else { 1.2 }),
         ("in the last quarter", |n| if n < 48 { 0.0 } else { -1.2 }),
         ("a ramp", |n| n as f64 / 64.0 * 2.0),
