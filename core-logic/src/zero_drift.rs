@@ -33,7 +33,7 @@ pub struct ZeroDriftConfig {
     /// Valid readings that a calibration takes.
     pub samples: u16,
     /// Largest distance between the lowest and the highest of them; of readings with noise ([`ZeroConditions::noisy`]) between the means
-    /// of the run's quarters, and [`NOISY_SPREADS`] times as much between single ones.
+    /// of the run's quarters, and `NOISY_SPREADS` times as much between single ones.
     pub max_spread: PerRange<Microamps>,
     /// Largest mean current of the energy meter, both signs, at which there may be no current flowing. The meter's own
     /// zero error is in it.
