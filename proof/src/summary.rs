@@ -1357,7 +1357,7 @@ mod tests {
             [FormLine {
                 effect: "quadratic".into(),
                 kind: "d".into(),
-                right: vec!["square".into()],
+                right: vec!["square".into(), "curve".into()],
                 cases: 4,
                 told: 2,
                 another: 1,
