@@ -196,7 +196,7 @@ impl Extent {
         high: Microamps(i32::MIN),
     };
 
-    /// With `value` in it.
+    /// Takes `value` in, and says how far apart the ends are then. Once in the image: it is asked twice a reading, and flash is short.
     #[inline(never)]
     fn widened(&mut self, value: Microamps) -> Microamps {
         self.low = self.low.min(value);

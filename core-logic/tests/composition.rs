@@ -721,7 +721,6 @@ fn a_zero_calibration_reports_progress_ends_and_can_be_aborted() {
     assert_eq!(bench.readings().command_reason, Refusal::Timeout as u16);
 }
 
-/// The command of a key-state calibration ends with the key cycle that it waits for.
 /// D3 at rest, as `firmware/src/analog.rs` reads it with `codes` of noise, rms, in each conversion: four of the network to a reading, and a
 /// mean over 16 of the reference, of which every second tick has one.
 struct NoisyNetwork {
@@ -839,6 +838,7 @@ fn a_noisy_network_s_zero_is_taken_and_a_current_that_moves_is_refused() {
     }
 }
 
+/// The command of a key-state calibration ends with the key cycle that it waits for.
 #[test]
 fn an_ordered_key_calibration_ends_as_done_or_failed() {
     let mut bench = Bench::new(Configuration::default());

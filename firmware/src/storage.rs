@@ -42,8 +42,9 @@ type Chip = Flash<spi::Device<SPI2, PB12<Output>>>;
 const CONFIGURATION: Range<u32> = 0x00_0000..0x00_4000;
 const STATE: Range<u32> = 0x01_0000..0x02_0000;
 const LOG: Range<u32> = 0x20_0000..0x40_0000;
-// The smallest intervals of saving are worked out by it.
+// The smallest intervals of saving are worked out by them.
 const _: () = assert!((STATE.end - STATE.start) as i64 == design::STATE_FLASH_BYTES);
+const _: () = assert!(SECTOR as i64 == design::FLASH_SECTOR_BYTES);
 
 /// So much of the log is looked through in one turn: 32 sectors, 0.2 ms.
 const LOOKED_AT: u32 = 32 * SECTOR;

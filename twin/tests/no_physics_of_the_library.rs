@@ -8,9 +8,9 @@ mod common;
 use common::{noise, prepared, said, sensor, steps};
 use twin::report::data::{Report, Verdict};
 
-/// What is said of a state of charge in steps of half a per cent that is corrected once, at 1200 s of 2000 s, by so many points. The
-/// capacity is right.
-fn corrected_once(points: f64, seed: u64) -> Report {
+/// What is said of a state of charge in steps of half a per cent over 2000 s around a usual current that is off by so many
+/// points, by the second and the current. The capacity is right.
+fn state_of_charge(seed: u64, usual_a: f64, off_points: impl Fn(u32, f64) -> f64) -> Report {
     let (capacity_ah, initial_soc) = (60.0, 0.9);
     let mut load_a = noise(seed, 25.0);
     let (mut charge_c, mut current_a) = (0.0, 30.0);
@@ -18,11 +18,11 @@ fn corrected_once(points: f64, seed: u64) -> Report {
     for second in 0..2000 {
         let before_a = current_a;
         if second % 20 == 0 {
-            current_a = 30.0 + load_a();
+            current_a = usual_a + load_a();
         }
         charge_c += 0.5 * (before_a + current_a);
-        let corrected = if second < 1200 { 0.0 } else { points };
-        let soc_pct = 100.0 * (initial_soc - charge_c / 3600.0 / capacity_ah) + corrected;
+        let soc_pct =
+            100.0 * (initial_soc - charge_c / 3600.0 / capacity_ah) + off_points(second, current_a);
         text.push_str(&format!(
             "{second},{current_a},{}\n",
             (2.0 * soc_pct).round() / 2.0
@@ -38,7 +38,8 @@ fn corrected_once(points: f64, seed: u64) -> Report {
 #[test]
 fn a_state_of_charge_that_is_corrected_once_is_no_capacity() {
     for (points, seed) in [(10.0, 1), (7.0, 2), (-5.0, 3), (-8.0, 4)] {
-        let report = corrected_once(points, seed);
+        let corrected = |second, _| if second < 1200 { 0.0 } else { points };
+        let report = state_of_charge(seed, 30.0, corrected);
         assert_eq!(report.verdict, Verdict::Unknown, "{points}: {report:?}");
         let form = report.unexplained[0].form.as_ref();
         let form = form.unwrap_or_else(|| panic!("{points}: {:?}", report.unexplained));
@@ -50,25 +51,10 @@ fn a_state_of_charge_that_is_corrected_once_is_no_capacity() {
     }
 }
 
-/// What is said of a state of charge in steps of half a per cent that reads the load's drop of the voltage as charge.
+/// It reads the load's drop of the voltage as charge.
 #[test]
 fn a_state_of_charge_that_falls_with_the_load_is_told_by_the_current() {
-    let mut load_a = noise(5, 25.0);
-    let (mut charge_c, mut current_a) = (0.0, 30.0);
-    let mut text = "t_s,i_ref_a,soc_pct\n".to_owned();
-    for second in 0..2000 {
-        let before_a = current_a;
-        if second % 20 == 0 {
-            current_a = 10.0 + load_a();
-        }
-        charge_c += 0.5 * (before_a + current_a);
-        let soc_pct = 100.0 * (0.9 - charge_c / 3600.0 / 60.0) - 0.05 * current_a;
-        let read_pct = (2.0 * soc_pct).round() / 2.0;
-        text.push_str(&format!("{second},{current_a},{read_pct}\n"));
-    }
-    let model = "schema = 1\n[battery]\ncapacity_ah = 60.0\ninitial_soc = 0.9\n";
-    let mut prepared = prepared(&text, model);
-    let report = said(prepared.items.remove(0).problem, 5, &[]);
+    let report = state_of_charge(5, 10.0, |_, current_a| -0.05 * current_a);
     assert_eq!(report.verdict, Verdict::Unknown, "{report:?}");
     let form = report.unexplained[0].form.as_ref().expect("a form");
     assert_eq!(form.id, "follows", "{form:?}");

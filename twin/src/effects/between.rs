@@ -220,7 +220,6 @@ struct Course<'s> {
     between: &'s Between,
     /// Straight lines: the signal, or what goes into its low-pass.
     lines: &'s [f64],
-    held: bool,
     at: Place<'s>,
     /// Where a mean is ahead of the converter: the lines behind it, and the place a window earlier.
     ahead: Option<(MeansOfMean<'s>, Place<'s>)>,
@@ -267,20 +266,19 @@ impl<'s> Course<'s> {
         Self {
             between,
             lines,
-            held,
             at: place(),
             ahead,
         }
     }
 
     fn value(&mut self, t: f64) -> f64 {
-        let cursor = &mut self.at.cursors[0];
+        let (held, cursor) = (self.at.held, &mut self.at.cursors[0]);
         let straight = match &self.between.low_pass {
             Some(low_pass) => {
                 cursor.seek(t);
-                low_pass.beyond(cursor, t, self.held)
+                low_pass.beyond(cursor, t, held)
             }
-            None => cursor.value(self.lines, t, self.held),
+            None => cursor.value(self.lines, t, held),
         };
         let decays = self.at.decays[0].iter_mut();
         straight + decays.map(|decay| decay.value(t)).sum::<f64>()

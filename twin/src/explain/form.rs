@@ -26,6 +26,8 @@ const TOLD: f64 = 0.95;
 const BEYOND: f64 = 0.2;
 /// Two forms are told apart by the sum of what one is better by, block by block, from so many of its standard deviations on.
 const APART: f64 = 2.0;
+/// Rows that a stretch of a variable has at least, of which a form has a value of its own.
+const LEAST_ROWS: usize = 20;
 /// Forms that the readings do not tell apart and that are named beside each other.
 const MOST: usize = 3;
 
@@ -182,6 +184,11 @@ impl<'a> Says<'a> {
             of,
             view,
         }
+    }
+
+    /// Whether something may be off in proportion to the current: a state of charge is no answer to it.
+    fn has_slopes(&self) -> bool {
+        self.view != View::StateOfCharge
     }
 
     fn is_voltage(&self) -> bool {

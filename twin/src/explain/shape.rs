@@ -32,6 +32,12 @@ fn hats(bench: &Workbench<'_>) -> Vec<Vec<f64>> {
         .collect();
     let least = 1e-3 * bench.scale.largest;
     knots.dedup_by(|a, b| *a - *b < least);
+    hats_between(x, &knots)
+}
+
+/// Columns of straight lines between knots at rows of a current: each 1 at its knot and 0 at the next ones, the first and last held beyond
+/// the ends.
+pub(super) fn hats_between(x: &[f64], knots: &[f64]) -> Vec<Vec<f64>> {
     (0..knots.len())
         .map(|k| {
             x.iter()

@@ -1,14 +1,12 @@
 //! A form that steps where a variable passes a value: a level in time, a slope beyond a size of the current.
 
-use super::{Made, Says, Shape, current};
+use super::{LEAST_ROWS, Made, Says, Shape, current};
 use crate::explain::locate::{Kind, Variable, variables};
 use crate::explain::workbench::Workbench;
-use crate::problem::View;
 use crate::report::format::significant;
 
-/// Each side of a step has this share of the energy of what steps, and this many rows.
+/// Each side of a step has this share of the energy of what steps, and [`LEAST_ROWS`].
 const LEAST_SIDE: f64 = 0.01;
-const LEAST_ROWS: usize = 20;
 
 /// All of them.
 pub(super) fn all<'a>(
@@ -28,8 +26,7 @@ pub(super) fn all<'a>(
     let one = vec![1.0; bench.len()];
     let mut all: Vec<Box<dyn Shape + 'a>> = Vec::new();
     for variable in std::iter::once(time).chain(others) {
-        // Beyond a size of the current a slope of its own, as a second range has it; a slope for each sign is no step, and a state of
-        // charge has none.
+        // Beyond a size of the current a slope of its own, as a second range has it; a slope for each sign is no step.
         if variable.kind != Kind::Size {
             all.push(Box::new(Cut::new(
                 &variable,
@@ -39,7 +36,7 @@ pub(super) fn all<'a>(
                 residual,
             )));
         }
-        if variable.kind != Kind::Itself && says.view != View::StateOfCharge {
+        if variable.kind != Kind::Itself && says.has_slopes() {
             let x = current(bench).to_vec();
             all.push(Box::new(Cut::new(&variable, x, true, says, residual)));
         }

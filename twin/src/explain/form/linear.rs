@@ -1,10 +1,11 @@
 //! Forms that are a weighted sum of a few columns: curves, drifts, slopes of their own, what follows another quantity, a memory.
 
-use super::{Made, Says, Shape, at_place, current, place_of, signed};
+use super::{LEAST_ROWS, Made, Says, Shape, at_place, current, place_of, signed};
 use crate::effects::scene::Steps;
 use crate::explain::flexible::at_rows;
 use crate::explain::locate::{Kind, variables};
 use crate::explain::normal::{normal, solve};
+use crate::explain::shape::hats_between;
 use crate::explain::workbench::Workbench;
 use crate::problem::View;
 use crate::report::format::significant;
@@ -16,8 +17,6 @@ const TIMES: usize = 8;
 
 /// Stretches of the current over each of which a curve of any shape is a straight line.
 const STRETCHES: usize = 12;
-/// Each has this many rows.
-const LEAST_ROWS: usize = 20;
 /// Places at which such a curve is told.
 const PLACES: usize = 7;
 
@@ -82,8 +81,7 @@ pub(super) fn all<'a>(bench: &'a Workbench<'_>, says: Says<'a>) -> Vec<Box<dyn S
     let mut all = vec![line(bench)];
     all.extend(drifts(bench, says));
     all.extend(around(bench, says));
-    // What is charged is no share of a state of charge.
-    if says.view != View::StateOfCharge {
+    if says.has_slopes() {
         all.extend([direction(bench, says), sign(bench, says)]);
         all.extend(curves(bench, says));
         all.extend(curve(bench, says));
@@ -209,15 +207,7 @@ fn knots(x: &[f64]) -> Option<Vec<f64>> {
 fn curve<'a>(bench: &Workbench<'_>, says: Says<'a>) -> Option<Linear<'a>> {
     let x = current(bench);
     let knots = knots(x)?;
-    let mut columns = vec![vec![0.0; x.len()]; knots.len()];
-    for (row, x) in x.iter().enumerate() {
-        let above = knots.partition_point(|knot| knot <= x);
-        let above = above.clamp(1, knots.len() - 1);
-        let [from, to] = [knots[above - 1], knots[above]];
-        let share = ((x - from) / (to - from)).clamp(0.0, 1.0);
-        columns[above - 1][row] = 1.0 - share;
-        columns[above][row] = share;
-    }
+    let columns = hats_between(x, &knots);
     Some(Linear::new("curve", columns, move |values| {
         let (of_values, of_knots) = (place_of(values), place_of(&knots));
         let last = knots.len() - 1;
@@ -244,7 +234,7 @@ fn drifts<'a>(bench: &Workbench<'_>, says: Says<'a>) -> Vec<Linear<'a>> {
     let mut drifts = vec![Linear::new("drift", vec![one, hours], move |values| {
         format!("a drift of {} {} an hour", signed(values[1]), says.unit)
     })];
-    if says.view != View::StateOfCharge {
+    if says.has_slopes() {
         drifts.push(Linear::new("slope-drift", slopes, move |values| {
             format!("a drift of {} an hour", says.slope(values[2]))
         }));
@@ -255,11 +245,10 @@ fn drifts<'a>(bench: &Workbench<'_>, says: Says<'a>) -> Vec<Linear<'a>> {
 /// What follows a quantity that was recorded beside: it, its square, and the current times it. Beside a state of charge the current itself
 /// is one.
 fn around<'a>(bench: &'a Workbench<'_>, says: Says<'a>) -> Vec<Linear<'a>> {
-    let is_charge = says.view == View::StateOfCharge;
     let all = variables(bench).into_iter().filter(|variable| {
         let is_beside = match variable.kind {
             Kind::Beside => true,
-            Kind::Itself => is_charge,
+            Kind::Itself => !says.has_slopes(),
             _ => false,
         };
         is_beside && variable.values.iter().all(|z| z.is_finite())
@@ -284,7 +273,7 @@ fn around<'a>(bench: &'a Workbench<'_>, says: Says<'a>) -> Vec<Linear<'a>> {
                 format!("{size} {unit}/{of_square}² times {name}², beside a straight line")
             }),
         ];
-        if !is_charge {
+        if says.has_slopes() {
             around.push(Linear::new("slope-follows", slopes, move |values| {
                 format!("{} per {of_slope} of {name}", says.slope(values[3]))
             }));
