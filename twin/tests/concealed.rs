@@ -345,13 +345,11 @@ fn a_drift_with_temperature() {
     );
 }
 
-#[test]
-fn a_lag_and_what_is_said_without_it() {
-    let truth = truth();
-    let (tau_s, h) = (0.35, STEP_S / FINE as f64);
+/// The current behind a low-pass.
+fn lagged(truth: &Truth, tau_s: f64) -> Vec<f64> {
     let mut y = truth.current_a[0];
-    let kept = (-h / tau_s).exp();
-    let fine = fine(&truth);
+    let kept = (-STEP_S / FINE as f64 / tau_s).exp();
+    let fine = fine(truth);
     let mut reading = vec![y];
     for k in 1..fine.len() {
         y = kept * y + (1.0 - kept) * 0.5 * (fine[k] + fine[k - 1]);
@@ -359,6 +357,13 @@ fn a_lag_and_what_is_said_without_it() {
             reading.push(y);
         }
     }
+    reading
+}
+
+#[test]
+fn a_lag_and_what_is_said_without_it() {
+    let (truth, tau_s) = (truth(), 0.35);
+    let reading = lagged(&truth, tau_s);
     assert_named(
         &explained(&truth, reading.clone(), 5, &[]),
         "lag",
@@ -509,6 +514,38 @@ fn nothing_stands_beside_a_dead_band_that_noise_comes_through() {
         let reading = seen.map(|x| if x.abs() < 15.0 { 0.0 } else { x }).collect();
         let report = explained_as_read(&truth, reading, Coloured::default(), seed, &[]);
         assert_named(&report, "dead-band", &[("threshold_a", 15.0, 0.5)]);
+    }
+}
+
+/// A twentieth of what the lag changes is more than all that the dead band does; but with it noise is left and nothing else.
+#[test]
+fn a_dead_band_behind_a_lag_and_a_gain() {
+    const QUIET_A: f64 = 0.1;
+    let (truth, tau_s, gain, threshold_a) = (truth(), 0.2, 1.02, 2.0);
+    for seed in 44..47 {
+        let mut noise = noise(seed, QUIET_A);
+        let seen = lagged(&truth, tau_s).into_iter();
+        let seen = seen.map(|i| gain * i + noise());
+        let reading = seen.map(|x| if x.abs() < threshold_a { 0.0 } else { x });
+        let (t_s, current_a) = (truth.t_s.clone(), truth.current_a.clone());
+        let report = said(
+            sensor(t_s, current_a, reading.collect(), QUIET_A),
+            seed,
+            &[],
+        );
+        let values = [
+            ("lag", tau_s, 0.002),
+            ("gain", gain, 0.001),
+            // By the few readings next to it.
+            ("dead-band", threshold_a, QUIET_A),
+        ];
+        assert_eq!(report.effects.len(), values.len(), "{}", report.summary);
+        for (id, value, by) in values {
+            let effect = report.effects.iter().find(|effect| effect.id == id);
+            let found = effect.unwrap().parameters[0].value;
+            assert!((found - value).abs() < by, "{id}: {found}");
+        }
+        assert_eq!(report.verdict, Verdict::Explained, "{}", report.summary);
     }
 }
 

@@ -8,7 +8,6 @@ use super::slope;
 use super::unfitted::Unfitted;
 use super::workbench::{Member, Model, Workbench};
 use super::{Decided, Holdout, Options, decide, gained, lead_in, rms};
-use crate::effects::Search;
 use crate::problem::{Holds, Problem, View};
 use crate::report::data::Verdict;
 
@@ -225,7 +224,7 @@ impl Course<'_> {
             };
             if card.stage.is_between_rows() {
                 times.push(effect);
-            } else if parameter.search == Search::Linear && effect.idealised() == 0.0 {
+            } else if effect.is_plainest() {
                 let values = vec![parameter.off];
                 plainest.members.push(Member { effect, values });
             }

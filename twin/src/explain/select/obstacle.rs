@@ -7,9 +7,8 @@ use crate::explain::normal::dot;
 use crate::explain::robust::huber;
 use crate::explain::shape::without_memory;
 use crate::explain::slope::change;
-use crate::explain::strays::noise_is_stated;
 use crate::explain::told::short;
-use crate::explain::verdict::{STATED, allowed};
+use crate::explain::verdict::{STATED, allowed, unavoidable};
 use crate::explain::workbench::{Member, Model, Workbench};
 
 /// A named effect takes away at least this share of the held-out squared error (2 % of the held-out rms), overall or where it
@@ -24,6 +23,8 @@ const PAIRED: f64 = 3.0;
 pub const CERTAIN: f64 = 4.2;
 /// An equation is off along one effect by at most this many times the energy of what is left of the readings beyond noise.
 const ALONG: f64 = 4.0;
+/// Seed of the noise that is sent through what cuts or rounds, once for all models that are compared.
+const DRAWN: u64 = 0;
 /// Rows where an effect changes the reading by at least this share of its largest change are where it acts.
 const ACTS: f64 = 0.2;
 
@@ -267,12 +268,12 @@ pub(super) fn beside(bench: &Workbench<'_>, fit: &Fit, index: usize) -> f64 {
 }
 
 /// The most energy by which equations may be off along one effect, for what is left shows none of it: a wrong equation is not off along
-/// that effect alone. Without a bound where no noise is stated, or where more than white noise as it is stated comes through.
+/// that effect alone. Without a bound where no noise is stated, or one with a memory is.
 fn left_along(bench: &Workbench<'_>, fit: &Fit) -> f64 {
-    if bench.problem.coloured.rms > 0.0 || !noise_is_stated(bench, fit) {
+    if bench.problem.coloured.rms > 0.0 || bench.problem.noise <= 0.0 {
         return f64::INFINITY;
     }
-    let allowed = allowed(bench, bench.problem.noise.powi(2) * bench.len() as f64);
+    let allowed = allowed(bench, unavoidable(bench, fit, DRAWN));
     let left = dot(&fit.residual, &fit.residual) - allowed;
     ALONG * left.max((STATED - 1.0) * allowed)
 }

@@ -12,6 +12,7 @@ use crate::explain::quieter::only_quietens;
 use crate::explain::robust::loss;
 use crate::explain::screen::screen;
 use crate::explain::workbench::{Member, Model, Workbench};
+use crate::problem::Base;
 
 /// A rival is fitted if its start takes this share of what the effect takes whose place it would have. Of 830 that took half as
 /// much in the end, all but eight began so (counted once, on 149 cases of the campaign's `--seeds 0`).
@@ -113,15 +114,28 @@ fn nearest(
         .collect()
 }
 
-/// Models with two effects in the place of one that may stand for them; `without` has none of the three.
+/// Models with two effects in the place of one that may stand for them; `without` has none of the three. Over currents that hardly
+/// move any curve may stand for a straight line, a factor with a constant.
 fn of_two(bench: &Workbench<'_>, without: &Fit, one: &'static dyn Effect) -> Vec<Model> {
+    let bends = matches!(bench.problem.base, Base::Sensor(_))
+        && one.idealised() > 0.0
+        && !one.card().stage.is_between_rows();
+    let plainest = bench
+        .library
+        .iter()
+        .filter(|effect| bends && effect.is_plainest());
+    let plainest: Vec<&str> = plainest.map(|effect| effect.card().id).collect();
+    let lines = plainest
+        .iter()
+        .enumerate()
+        .flat_map(|(place, first)| plainest[place + 1..].iter().map(|second| [*first, *second]));
     let begun = |beside: &Fit, id: &str| -> Option<Model> {
         let mut library = bench.library.iter().copied();
         let effect = library.find(|effect| effect.card().id == id && !beside.model.has(id))?;
         let start = nearest(bench, beside, effect, None).into_iter().next()?;
         Some(beside.model.with(start))
     };
-    let pairs = one.stands_for().iter();
+    let pairs = one.stands_for().iter().copied().chain(lines);
     pairs
         .filter_map(|[first, second]| {
             let first = fit(bench, &begun(without, first)?, None);
