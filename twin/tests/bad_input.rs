@@ -1064,6 +1064,51 @@ fn a_reference_that_stands_is_not_at_fault() {
 }
 
 #[test]
+fn a_log_of_a_parked_car() {
+    let noise = |t: f64, k: f64| ((k * 12.9898 * t).sin() * 43_758.547).fract();
+    let parked = |reference: &dyn Fn(f64) -> f64| {
+        "t_s,i_ref_a,i_meas_a\n".to_owned()
+            + &rows(600, |t| {
+                let i = reference(t);
+                format!("{t},{i},{}", i + 0.5 + 0.5 * noise(t, 1.0))
+            })
+    };
+    // Noise that hides what the reference does says nothing of the sensor's being dead.
+    let model = "schema = 1\n[sensor]\nnoise = 0.3\n";
+    let recording = parked(&|t| 0.01 * noise(t, 1.7));
+    let said = report(&[("m.toml", model), ("r.csv", &recording)], &[]);
+    let remarks = said["remarks"].to_string();
+    says(&remarks, &["stands still", "at 0 A its zero"]);
+    assert!(!remarks.contains("dead"), "{remarks}");
+    assert_eq!(said["effects"][0]["id"], "offset", "{said}");
+
+    // Zeros alone explain nothing, and are a file to ask whether a zero holds.
+    let zeros = parked(&|_| 0.0);
+    says(
+        &explained(model, &zeros),
+        &["column i_ref_a: found 0 in every row, expected a signal that moves"],
+    );
+    let recording = "t_s,i_ref_a,i_meas_a\n".to_owned()
+        + &rows(600, |t| {
+            format!(
+                "{t},{},{}",
+                current(t),
+                current(t) + 0.5 + 0.5 * noise(t, 1.0)
+            )
+        });
+    let files = [
+        ("m.toml", model),
+        ("r.csv", &recording),
+        ("zero.csv", &zeros),
+    ];
+    let said = report(&files, &["--holdout", "zero.csv"]);
+    let there = &said["holdouts"][0];
+    assert_eq!(there["file"], "zero.csv");
+    let rmse = |key: &str| there[key].as_f64().unwrap();
+    assert!(rmse("rmse_after") < 0.7 * rmse("rmse_before"), "{there}");
+}
+
+#[test]
 fn a_delay_beyond_the_recording() {
     let model = "schema = 1\n[sensor]\n[effects.delay]\ndelay_s = 1e9\n";
     says(

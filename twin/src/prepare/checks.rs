@@ -612,13 +612,20 @@ pub(super) fn plausible(
         return remarks;
     }
     let together = correlation(beside(drive, observed, &wild.rows));
-    if together.abs() < UNRELATED {
+    let spread_x = spread(beside(drive, observed, &wild.rows).map(|(reference, _)| reference));
+    let spread_y = spread(beside(drive, observed, &wild.rows).map(|(_, reading)| reading));
+    if spread_x <= sensor.noise {
+        // Whether a reading follows that, its noise hides.
+        remarks.push(format!(
+            "{reference} moves by {spread_x:.4}, no more than the noise of {measured} ({:.4}): a current that stands still tells one point of \
+             the sensor's curve (at 0 A its zero) and nothing else",
+            sensor.noise
+        ));
+    } else if together.abs() < UNRELATED {
         remarks.push(format!(
             "{measured} does not follow {reference} (correlation {together:.2}): the sensor may be dead, or the reference be that of another conductor"
         ));
     }
-    let spread_x = spread(beside(drive, observed, &wild.rows).map(|(reference, _)| reference));
-    let spread_y = spread(beside(drive, observed, &wild.rows).map(|(_, reading)| reading));
     let factor = f64::max(spread_x / spread_y, spread_y / spread_x);
     if factor > NO_GAIN && together > -SURELY_OPPOSITE {
         remarks.push(format!(
