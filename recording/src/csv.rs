@@ -280,7 +280,14 @@ impl Decimal {
     /// A field's number; what is wrong with it, and what was expected. One mark in one file: elsewhere the other one may part
     /// thousands.
     fn value(&mut self, field: &str, line: u64) -> std::result::Result<f64, (Kind, String)> {
-        let plain = |kind| (kind, "a number or an empty field".to_owned());
+        let plain = |kind| {
+            let hint = if is_date_or_time(field) {
+                "; times are numbers, in s, whatever they count from"
+            } else {
+                ""
+            };
+            (kind, format!("a number or an empty field{hint}"))
+        };
         if !self.may_be_comma {
             return value(field).map_err(plain);
         }
@@ -317,6 +324,28 @@ fn value(field: &str) -> std::result::Result<f64, Kind> {
         return Err(Kind::Infinite);
     }
     Ok(number)
+}
+
+/// Whether a field is what a clock or a calendar shows: `08:00:00.5`, `2026-03-29T00:50`, `29.03.2026`.
+fn is_date_or_time(field: &str) -> bool {
+    let field = field.trim_ascii();
+    if !field.starts_with(|first: char| first.is_ascii_digit()) {
+        return false;
+    }
+    // An hour or a minute, and the two digits of what follows it.
+    let is_clock = field
+        .as_bytes()
+        .windows(4)
+        .any(|part| matches!(part, [b'0'..=b'9', b':', b'0'..=b'5', b'0'..=b'9']));
+    // Three groups of digits, one of them a year: those of a number in thousands have three digits.
+    let is_date = ['-', '/', '.'].iter().any(|mark| {
+        let groups: Vec<&str> = field.split(*mark).collect();
+        let is_digits = |group: &&str| group.bytes().all(|byte| byte.is_ascii_digit());
+        let years = groups.iter().filter(|group| group.len() == 4).count();
+        let others = groups.iter().filter(|group| (1..=2).contains(&group.len()));
+        groups.len() == 3 && groups.iter().all(is_digits) && years == 1 && others.count() == 2
+    });
+    is_clock || is_date
 }
 
 /// Lines with their numbers, without their ends; blank ones are left out.

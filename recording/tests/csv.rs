@@ -80,7 +80,7 @@ fn a_separator_that_a_spreadsheet_states_is_no_header() {
 /// Each fault with the sentence it is told in.
 #[test]
 fn every_fault_has_its_place() {
-    let cases: [(&str, Kind, &str); 28] = [
+    let cases: [(&str, Kind, &str); 32] = [
         (
             "",
             Kind::Empty,
@@ -140,6 +140,30 @@ fn every_fault_has_its_place() {
             "t_s,i_ref_a\n0,1\n\n1,abc\n",
             Kind::NotANumber,
             "r.csv, line 4, column 2 (i_ref_a): found \"abc\", expected a number or an empty field",
+        ),
+        // Times as clocks and calendars show them; thousands set apart by points are none.
+        (
+            "t_s,i_ref_a\n2026-03-29T00:50:00.000,1\n",
+            Kind::NotANumber,
+            "r.csv, line 2, column 1 (t_s): found \"2026-03-29T00:50:00.000\", expected a number or an empty field; times are numbers, in s, \
+             whatever they count from",
+        ),
+        (
+            "t_s;i_ref_a\n08:00:00,25;1\n",
+            Kind::NotANumber,
+            "r.csv, line 2, column 1 (t_s): found \"08:00:00,25\", expected a number or an empty field; times are numbers, in s, whatever \
+             they count from",
+        ),
+        (
+            "t_s,i_ref_a\n29.03.2026,1\n",
+            Kind::NotANumber,
+            "r.csv, line 2, column 1 (t_s): found \"29.03.2026\", expected a number or an empty field; times are numbers, in s, whatever \
+             they count from",
+        ),
+        (
+            "t_s;i_ref_a\n1.234.567;1\n",
+            Kind::NotANumber,
+            "r.csv, line 2, column 1 (t_s): found \"1.234.567\", expected a number or an empty field",
         ),
         (
             "t_s,i_ref_a\n0,1,5\n",
