@@ -126,6 +126,9 @@ impl Signal {
     }
 }
 
+/// Clocks that are so far apart, in s, count from different moments (one since 1970, say): a day.
+const OTHER_ORIGIN_S: f64 = 86_400.0;
+
 /// How the reference is smoothed before it is compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Shape {
@@ -155,10 +158,22 @@ impl Alignment {
 
     /// What is said of it in the report.
     pub fn remark(&self) -> String {
+        let stands = if self.offset_s.abs() < OTHER_ORIGIN_S {
+            format!(
+                "the sensor's time is {:+.6} s from the reference's at its first reading and",
+                -self.offset_s
+            )
+        } else {
+            // The difference of two origins is no number that anybody looks for.
+            format!(
+                "the sensor's first reading, at {} s of its own clock, was at {:.3} s of the reference's, which counts from another moment; the sensor's clock",
+                number((self.start_s * 1e3).round() / 1e3),
+                self.start_s + self.offset_s
+            )
+        };
         format!(
-            "the clocks of sensor and reference were compared: the sensor's time is {:+.6} s from the reference's at its \
-             first reading and runs {} by {:.1} ppm; both are taken out (correlation {:.4} after that)",
-            -self.offset_s,
+            "the clocks of sensor and reference were compared: {stands} \
+             runs {} by {:.1} ppm; both are taken out (correlation {:.4} after that)",
             if self.fast_ppm < 0.0 { "slow" } else { "fast" },
             self.fast_ppm.abs(),
             self.correlation

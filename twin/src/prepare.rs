@@ -230,6 +230,14 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
     {
         work.remark(remark);
     }
+    if let Some(remark) =
+        of_view(View::Voltage).and_then(|item| battery::other_cells(&item.problem))
+    {
+        work.remark(remark);
+    }
+    if let Some(remark) = battery::in_thousandths(model) {
+        work.remark(remark);
+    }
     if let Some(remark) = supply_without_range(&items) {
         work.remark(remark);
     }

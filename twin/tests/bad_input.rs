@@ -909,7 +909,11 @@ fn a_charge_in_another_unit_or_sign() {
     // A counter that is wrong is one all the same.
     for factor in [1.0, 2.0] {
         let said = report(&[("m.toml", COUNTED), ("r.csv", &counted(factor))], &[]);
-        assert!(said["remarks"].to_string().contains("set anew 1 times"));
+        assert!(
+            said["remarks"]
+                .to_string()
+                .contains("set anew once, where a new stretch begins")
+        );
     }
 }
 
@@ -1078,7 +1082,7 @@ fn a_log_of_a_parked_car() {
     let recording = parked(&|t| 0.01 * noise(t, 1.7));
     let said = report(&[("m.toml", model), ("r.csv", &recording)], &[]);
     let remarks = said["remarks"].to_string();
-    says(&remarks, &["stands still", "at 0 A its zero"]);
+    says(&remarks, &["i_ref_a moves by", "may tell a zero"]);
     assert!(!remarks.contains("dead"), "{remarks}");
     assert_eq!(said["effects"][0]["id"], "offset", "{said}");
 

@@ -5,7 +5,7 @@
 use std::{fs, path::Path};
 
 use twin::{
-    align::{Signal, estimate},
+    align::{Alignment, Signal, estimate},
     effects::scene::Scene,
     failure::Failure,
     model::Model,
@@ -665,7 +665,7 @@ fn a_counter_becomes_mean_currents_and_a_reset_cuts() {
     assert!(
         remarks
             .iter()
-            .any(|remark| remark.contains("set anew 1 times")),
+            .any(|remark| remark.contains("set anew once, where a new stretch begins")),
         "{remarks:?}"
     );
     assert_eq!(problem.drive.segments, vec![0..300, 300..600]);
@@ -1153,6 +1153,46 @@ fn a_code_for_not_available_is_no_reading() {
         assert!(held.iter().all(|c| (20.0..25.0).contains(c)), "{code}");
         assert_eq!(remarks.len(), 1, "{remarks:?}");
     }
+    // Ends of shorter numbers, of a reading beside its reference or the other way round, …
+    for code in [819.1, 409.5, -204.8, 102.3] {
+        for column in [1, 2] {
+            let (problem, remarks) = one(PAIR, &recording(column, code, &now_and_then));
+            assert_eq!(problem.observed.valid_rows(), 380, "{code}");
+            assert!(
+                remarks
+                    .join("; ")
+                    .contains(&format!("is {code} in 20 of 400 rows"))
+            );
+        }
+    }
+    // … and of temperatures, that jump there and back; a chamber goes there and stays.
+    let a_while = |k: i32| (100..130).contains(&k);
+    let for_good = |k: i32| k >= 300;
+    let odd = |k: i32| k % 2 == 1;
+    for code in [-40.0, 215.0, 819.1] {
+        for rows in [&now_and_then as &dyn Fn(i32) -> bool, &a_while] {
+            let (problem, remarks) = one(PAIR, &recording(3, code, rows));
+            let held = problem.drive.sensor_temperature_c.as_ref().unwrap();
+            assert!(held.iter().all(|c| (20.0..25.0).contains(c)), "{code}");
+            let said = remarks.join("; ");
+            assert!(
+                said.contains(&format!("temp_sensor_c is {code} in ")),
+                "{said}"
+            );
+        }
+    }
+    for (code, rows) in [
+        (-40.0, &for_good as &dyn Fn(i32) -> bool),
+        (-40.0, &odd),
+        (-39.9, &a_while),
+        (20.47, &a_while),
+    ] {
+        let (_, remarks) = one(PAIR, &recording(3, code, rows));
+        assert!(
+            !remarks.join("; ").contains("not available"),
+            "{code}: {remarks:?}"
+        );
+    }
     // Once is a slip, any other value an end of the range, and so is a code's next to the readings.
     let (problem, remarks) = one(PAIR, &recording(2, 3276.7, &|k| k == 77));
     assert_eq!(problem.observed.valid_rows(), 399);
@@ -1386,4 +1426,167 @@ fn holding_is_told_where_the_design_says_nothing_of_it() {
     };
     assert!((held(PAIR) - 1.0).abs() < 1e-9);
     assert_eq!(held(&format!("{PAIR}interval_s = 1.0\n")), 0.0);
+}
+
+/// A log of a column of times that went through single precision: of each 100 ms that count from `since_s`.
+fn single_precision(since_s: f64) -> String {
+    let rows = (0..3000).map(|k| {
+        let t_s = f64::from(k) * 0.1;
+        let told_s = f64::from((t_s + since_s) as f32);
+        vec![told_s, current(t_s), current(t_s) + 0.5]
+    });
+    text("t_s,i_ref_a,i_meas_a", rows)
+}
+
+#[test]
+fn times_of_single_precision_are_told() {
+    let said = |since_s: f64| {
+        let (_, remarks) = one(PAIR, &single_precision(since_s));
+        let mut said = remarks.into_iter();
+        said.find(|remark| remark.contains("single precision"))
+    };
+    let since_1970 = said(1.7e9).unwrap();
+    assert!(since_1970.contains("128 s apart"), "{since_1970}");
+    assert!(since_1970.contains("2,997 of 3,000 rows"), "{since_1970}");
+    // Two days: steps of 1/64 s.
+    assert!(said(172_800.0).unwrap().contains("0.01562 s apart"));
+    // What moves no row by as much as matters.
+    assert_eq!(said(0.0), None);
+    // Double precision, from the same origin; whole seconds, even; and rows that come when they like.
+    for of_row in [
+        |k: u32| 1.7e9 + 0.1 * f64::from(k),
+        |k: u32| 1_699_999_232.0 + 128.0 * f64::from(k),
+        |k: u32| f64::from(2 * k + k % 3),
+    ] {
+        let rows = (0..300).map(|k| {
+            let t_s = f64::from(k) * 0.1;
+            vec![of_row(k), current(t_s), current(t_s) + 0.5]
+        });
+        let (_, remarks) = one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows));
+        let told = remarks.iter().any(|remark| remark.contains("precision"));
+        assert!(!told, "{remarks:?}");
+    }
+    // A log that ends before the first step.
+    let rows = (0..300).map(|k| {
+        let t_s = f64::from(k) * 0.1;
+        vec![1.7e9, current(t_s), current(t_s) + 0.5]
+    });
+    let folder = tempfile::tempdir().unwrap();
+    let refused = read(
+        folder.path(),
+        PAIR,
+        &text("t_s,i_ref_a,i_meas_a", rows),
+        &[],
+    );
+    let refused = refused.unwrap_err().0;
+    assert!(
+        refused.contains("numbers of single precision, 24 bits, are 128 s apart there"),
+        "{refused}"
+    );
+}
+
+#[test]
+fn a_reference_that_hardly_moves_shows_no_dead_sensor() {
+    let log = |amplitude: f64| {
+        let rows = (0..2000).map(|k| {
+            let t_s = f64::from(k);
+            // Two courses that have nothing in common, one of them of 0.1 A.
+            let [reference, reading] = [amplitude * (37.7 * t_s).sin(), 0.1 * (1.91 * t_s).sin()];
+            vec![t_s, reference, 0.25 + reading]
+        });
+        one(PAIR, &text("t_s,i_ref_a,i_meas_a", rows)).1.join("\n")
+    };
+    let parked = log(0.01);
+    assert!(parked.contains("may tell a zero"), "{parked}");
+    assert!(!parked.contains("dead"), "{parked}");
+    assert!(log(10.0).contains("may be dead"));
+}
+
+/// Remarks on a pack's log of 10 minutes at rest and then under load, at 3.7 V a cell of `cells`.
+fn pack(cells: f64, battery: &str) -> Vec<String> {
+    let rows = (0..1200).map(|k| {
+        let t_s = f64::from(k) * 0.5;
+        let current_a = if k < 60 { 0.0 } else { 2.0 + current(t_s) };
+        vec![t_s, current_a, cells * (3.7 - 0.02 * current_a)]
+    });
+    let model =
+        format!("schema = 1\n[battery]\nocv = [[0, 3.2], [1, 4.2]]\ninitial_soc = 0.5\n{battery}");
+    one(&model, &text("t_s,i_ref_a,v_pack_v", rows)).1
+}
+
+#[test]
+fn a_pack_of_another_number_of_cells_is_told() {
+    let stated = |cells: u32, sigma: f64| {
+        format!(
+            "capacity_ah = 50\nohmic_resistance_ohm = 0.02\nnoise_v = 0.05\ncells = {cells}\ninitial_soc_uncertainty = {sigma}\n"
+        )
+    };
+    let said = |cells: f64, stated: &str| {
+        let mut remarks = pack(cells, stated).into_iter();
+        remarks.find(|remark| remark.contains("cells would"))
+    };
+    let more = said(96.0, &stated(95, 0.01)).unwrap();
+    assert!(
+        more.contains("begins at 355.2 V, where 95 cells in series")
+            && more.contains("as 96 cells would"),
+        "{more}"
+    );
+    assert!(
+        said(96.0, &stated(97, 0.01))
+            .unwrap()
+            .contains("as 96 cells would")
+    );
+    // As stated; off by no whole cell, or by two; and where the start may be off by as much.
+    for (cells, stated) in [
+        (96.0, stated(96, 0.01)),
+        (95.5, stated(95, 0.01)),
+        (97.0, stated(95, 0.01)),
+        (96.0, stated(95, 0.05)),
+    ] {
+        assert_eq!(said(cells, &stated), None, "{cells} {stated}");
+    }
+}
+
+#[test]
+fn a_capacity_and_a_resistance_that_no_cell_has_together_are_told() {
+    let said = |capacity_ah: f64, ohm: f64| {
+        let battery = format!(
+            "capacity_ah = {capacity_ah}\nohmic_resistance_ohm = {ohm}\ncells = 96\nnoise_v = 0.05\n"
+        );
+        pack(96.0, &battery)
+            .into_iter()
+            .find(|remark| remark.contains("in thousandths"))
+    };
+    let in_mah = said(2810.0, 0.02).unwrap();
+    assert!(
+        in_mah.contains("capacity_ah = 2810 and") && in_mah.contains("would take 56.2 V"),
+        "{in_mah}"
+    );
+    // An 18650, a truck's battery, and a cell of 300 Ah.
+    for (capacity_ah, ohm) in [(2.81, 0.0225), (60.0, 0.005), (300.0, 0.0005)] {
+        assert_eq!(said(capacity_ah, ohm), None);
+    }
+}
+
+#[test]
+fn clocks_of_different_origins_are_told_by_one_moment_of_both() {
+    let said = |offset_s: f64| {
+        let alignment = Alignment {
+            offset_s,
+            fast_ppm: 79.2,
+            start_s: 1_239.567_2,
+            correlation: 0.996_7,
+        };
+        alignment.remark()
+    };
+    let near = said(3.2);
+    assert!(
+        near.contains("the sensor's time is -3.200000 s from the reference's at its first reading and runs fast by 79.2 ppm"),
+        "{near}"
+    );
+    let since_1970 = said(1_699_998_765.434_863);
+    assert!(
+        since_1970.contains("first reading, at 1239.567 s of its own clock, was at 1700000005.002 s of the reference's"),
+        "{since_1970}"
+    );
 }

@@ -13,7 +13,7 @@ use crate::{
     effects::{find_with, quantisation::lattice},
     explain::{self, by_temperature},
     failure::Failure,
-    model::Battery,
+    model::{Battery, Model},
     problem::{Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, View},
     report::format::at_most,
     simulate::board::Pace,
@@ -303,6 +303,80 @@ pub(super) fn out_of_charge(problem: &Problem) -> Option<String> {
         number(*most_s),
         number(*first_s)
     ))
+}
+
+/// A current that empties a cell in an hour takes this many times its open-circuit voltage, or more, over its resistance: that of no
+/// cell does (a coin cell's comes near once), and one that is stated in thousandths makes fifteen times.
+const NO_CELL: f64 = 2.0;
+
+/// What is to be said of a capacity and a resistance that no cell has together.
+pub(super) fn in_thousandths(model: &Model) -> Option<String> {
+    let battery = model.battery.as_ref()?;
+    let full_v = battery
+        .ocv
+        .iter()
+        .fold(0.0, |most, (_, v)| f64::max(most, *v));
+    let (capacity_ah, ohm) = (battery.capacity_ah, battery.resistance_ohm);
+    let drop_v = capacity_ah * ohm;
+    (full_v > 0.0 && drop_v > NO_CELL * full_v).then(|| {
+        format!(
+            "{}: with capacity_ah = {} and ohmic_resistance_ohm = {}, a current that empties the cell in an hour would take {} V over its \
+             resistance, where its open-circuit voltage is {} V at most: no cell is like that; expected Ah and Ω (one of the two may be in \
+             thousandths)",
+            model.source,
+            number(capacity_ah),
+            number(ohm),
+            at_most(drop_v, 3),
+            at_most(full_v, 3)
+        )
+    })
+}
+
+/// A voltage is that of one cell more, or less, if it is off by one cell's to this share of it.
+const ONE_CELL: f64 = 0.25;
+/// Standard uncertainties of the state of charge at the start within which that may be why.
+const MAY_BE_START: f64 = 2.0;
+/// A cell's voltage shows in one reading from this many times its noise on.
+const SHOWS: f64 = 5.0;
+
+/// What is to be said of a pack that begins at the voltage of one cell more, or less, than the model file states.
+pub(super) fn other_cells(problem: &Problem) -> Option<String> {
+    let Base::Battery(base) = &problem.base else {
+        return None;
+    };
+    if problem.name != PACK || base.cells < 2.0 {
+        return None;
+    }
+    let observed = &problem.observed;
+    let begun = |problem: &Problem| -> Option<(usize, f64)> {
+        let said = explain::predict(problem, &[]).into_iter().enumerate();
+        let mut told = said.filter(|(row, v)| observed.valid[*row] && v.is_finite());
+        told.next()
+    };
+    let (row, designed_v) = begun(problem)?;
+    let off_v = observed.value[row] - designed_v;
+    let cell_v = designed_v / base.cells;
+    if (off_v.abs() / cell_v - 1.0).abs() > ONE_CELL || cell_v < SHOWS * problem.noise {
+        return None;
+    }
+    let mut moved = problem.clone();
+    if let Base::Battery(base) = &mut moved.base {
+        let open = MAY_BE_START * base.initial_soc_sigma.first().copied().unwrap_or_default();
+        let towards = open.copysign(off_v);
+        base.initial_soc.iter_mut().for_each(|soc| *soc += towards);
+    }
+    let may_be_start = begun(&moved).is_some_and(|(_, v)| (v - designed_v).abs() >= off_v.abs());
+    (!may_be_start).then(|| {
+        let there = base.cells + off_v.signum();
+        format!(
+            "{PACK} begins at {} V, where {} cells in series at the stated state of charge make {} V: as {} cells would (cells in [battery]), or \
+             initial_soc or the voltage's gain is off",
+            at_most(observed.value[row], 5),
+            number(base.cells),
+            at_most(designed_v, 5),
+            number(there)
+        )
+    })
 }
 
 /// What is taken of resistances at temperatures at which the model file does not say what they are.

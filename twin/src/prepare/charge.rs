@@ -89,7 +89,12 @@ pub(super) fn item(
         differences(drive, &readings, &rows, interval_s, step_c, largest);
     if resets > 0 {
         work.remark(format!(
-            "{column} was set anew {resets} times; each begins a new stretch"
+            "{column} was set anew {}",
+            if resets == 1 {
+                "once, where a new stretch begins".to_owned()
+            } else {
+                format!("{resets} times; each begins a new stretch")
+            }
         ));
     }
     let spacing_s = series::spacing_s(&observed).max(f64::MIN_POSITIVE);

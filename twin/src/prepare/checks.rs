@@ -2,7 +2,7 @@
 
 use recording::error::number;
 
-use super::{FEWEST_ROWS, Frame, Purpose, battery::PACK, seconds, series::median, stairs};
+use super::{FEWEST_ROWS, Frame, Purpose, battery::PACK, seconds, series::median, stairs, stamps};
 use crate::{
     effects::{self, Stage, scene::integral},
     explain,
@@ -23,6 +23,8 @@ const RELATED: f64 = 0.5;
 const SURELY_OPPOSITE: f64 = -0.8;
 /// Below this magnitude of correlation the two have nothing in common.
 const UNRELATED: f64 = 0.1;
+/// A reference that moves by less than this share of the readings (a parked car's) correlates with none of them, whatever the sensor.
+const HARDLY: f64 = 0.2;
 /// A factor from which on a reading is more than off.
 const NO_GAIN: f64 = 5.0;
 /// A voltage further than this beyond the table's ends, as a factor, is not that of so many cells.
@@ -73,10 +75,13 @@ pub(super) fn time_goes_on(frame: &Frame) -> Result<(), Failure> {
     let moves = t_s.windows(2).any(|pair| pair[0] != pair[1]);
     match t_s.first() {
         Some(first) if !moves && t_s.len() > 1 => Err(Failure(format!(
-            "{}, column {}: found {} in every row, expected a time in s that goes on",
+            "{}, column {}: found {} in every row, expected a time in s that goes on{}",
             frame.source(),
             frame.origin("t_s"),
-            number(*first)
+            number(*first),
+            stamps::held_by_single(*first)
+                .map(|hint| format!(" ({hint})"))
+                .unwrap_or_default()
         ))),
         _ => Ok(()),
     }
@@ -614,12 +619,10 @@ pub(super) fn plausible(
     let together = correlation(beside(drive, observed, &wild.rows));
     let spread_x = spread(beside(drive, observed, &wild.rows).map(|(reference, _)| reference));
     let spread_y = spread(beside(drive, observed, &wild.rows).map(|(_, reading)| reading));
-    if spread_x <= sensor.noise {
-        // Whether a reading follows that, its noise hides.
+    if together.abs() < UNRELATED && spread_x < HARDLY * spread_y {
         remarks.push(format!(
-            "{reference} moves by {spread_x:.4}, no more than the noise of {measured} ({:.4}): a current that stands still tells one point of \
-             the sensor's curve (at 0 A its zero) and nothing else",
-            sensor.noise
+            "{reference} moves by {spread_x:.4} in all and {measured} by {spread_y:.4}: with so little of it this recording may tell a zero, \
+             and nothing of gain or time"
         ));
     } else if together.abs() < UNRELATED {
         remarks.push(format!(
@@ -731,9 +734,10 @@ fn spikes(drive: &Drive, observed: &Observed, reference: &str) -> Option<String>
     }
     let first = found.first()?;
     Some(format!(
-        "{reference} jumps there and back within one row in {} places that the sensor does not show, the first at {first} s: \
+        "{reference} jumps there and back within one row in {} places that the sensor does not show, the first at {} s: \
          the reference may be at fault",
-        found.len()
+        found.len(),
+        shown(*first)
     ))
 }
 
@@ -765,7 +769,7 @@ fn stuck(drive: &Drive, observed: &Observed, reference: &str, measured: &str) ->
                     "{reference} stands at {} for {} from {} s on while {measured} moves: the reference may be at fault",
                     number(stands_at),
                     seconds(drive.t_s[end - 1] - drive.t_s[start]),
-                    drive.t_s[start]
+                    shown(drive.t_s[start])
                 ));
             }
             start = end;

@@ -14,6 +14,11 @@ const ENDS: [f64; 6] = [
     2_147_483_648.0,
     4_294_967_295.0,
 ];
+/// Bits of shorter numbers that a bus packs a reading into, as many as it needs: their ends are values like any other, and codes only
+/// where more speaks for it.
+const SHORT_BITS: std::ops::RangeInclusive<i32> = 10..=15;
+/// A byte with its usual offset, in °C, as a bus has temperatures: both of its ends.
+const BYTE_C: [f64; 2] = [-40.0, 215.0];
 /// Decimals that a bus gives a number, at most: 0.1 mV.
 const DECIMALS: i32 = 4;
 /// What people write; unscaled, for 9.99 is a reading like any other.
@@ -24,6 +29,22 @@ const DIGITS: f64 = 1e-6;
 const FAR: f64 = 0.5;
 /// So often a value comes that is no slip.
 const OFTEN: usize = 3;
+/// A temperature is a code, if it may be one, where it is further from all others than this share of their range, …
+const FAR_ALONE: f64 = 1.0;
+/// … comes in no more than this share of the rows, …
+const SELDOM: f64 = 0.1;
+/// … and is gone in a row to where it came from, to within this share of the jump: no temperature does that.
+const THERE_AND_BACK: f64 = 0.2;
+
+/// What may be a code beside the ends of numbers of whole bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Others {
+    None,
+    /// Ends of shorter numbers.
+    Short,
+    /// Those and ends of a byte, of a temperature.
+    Temperature,
+}
 
 /// One code in one column.
 #[derive(Debug)]
@@ -46,7 +67,14 @@ pub(super) fn leave_out<'a>(
             continue;
         };
         let beside = partner(name).and_then(|other| table.column(other));
-        let Some((codes, [low, high])) = codes(values, beside) else {
+        let others = if name.starts_with("temp_") {
+            Others::Temperature
+        } else if beside.is_some() {
+            Others::Short
+        } else {
+            Others::None
+        };
+        let Some((codes, [low, high])) = codes(values, beside, others) else {
             continue;
         };
         for code in codes {
@@ -72,7 +100,27 @@ pub(super) fn leave_out<'a>(
     remarks
 }
 
-/// Whether a number is one that codes are made of.
+/// Whether a number is one that codes of this kind may be.
+fn may_be_code(value: f64, others: Others) -> bool {
+    is_code(value)
+        || others != Others::None && is_short(value)
+        || others == Others::Temperature && BYTE_C.contains(&value)
+}
+
+/// Whether a number is an end of one of fewer than 16 bits: the top of one without a sign, or either end of one with a sign.
+fn is_short(value: f64) -> bool {
+    (0..=DECIMALS).any(|decimals| {
+        let whole = value * 10_f64.powi(decimals);
+        SHORT_BITS.into_iter().any(|bits| {
+            let values = 2_f64.powi(bits);
+            [values - 1.0, -0.5 * values]
+                .iter()
+                .any(|end| (whole - end).abs() <= DIGITS * values)
+        })
+    })
+}
+
+/// Whether a number is one that codes are made of, in whatever column.
 fn is_code(value: f64) -> bool {
     let size = value.abs();
     NINES.contains(&size)
@@ -83,12 +131,13 @@ fn is_code(value: f64) -> bool {
 }
 
 /// The codes in a column, and between what its readings are.
-fn codes(values: &[f64], beside: Option<&[f64]>) -> Option<(Vec<Code>, [f64; 2])> {
+fn codes(values: &[f64], beside: Option<&[f64]>, others: Others) -> Option<(Vec<Code>, [f64; 2])> {
     let [low, high] = range(values.iter().copied())?;
-    if !is_code(low) && !is_code(high) {
+    let may_be_code = |value: f64| may_be_code(value, others);
+    if !may_be_code(low) && !may_be_code(high) {
         return None;
     }
-    let readings = || values.iter().copied().filter(|value| !is_code(*value));
+    let readings = || values.iter().copied().filter(|value| !may_be_code(*value));
     let ends = range(readings())?;
     let [low, high] = ends;
     let known = readings().filter(|value| value.is_finite()).count();
@@ -98,7 +147,7 @@ fn codes(values: &[f64], beside: Option<&[f64]>) -> Option<(Vec<Code>, [f64; 2])
     let mut found: Vec<Code> = Vec::new();
     for (row, value) in values.iter().enumerate() {
         let off = (value - high).max(low - value);
-        if off > FAR * (high - low) && is_code(*value) {
+        if off > FAR * (high - low) && may_be_code(*value) {
             match found.iter_mut().find(|code| code.value == *value) {
                 Some(code) => code.rows.push(row),
                 None => found.push(Code {
@@ -108,13 +157,18 @@ fn codes(values: &[f64], beside: Option<&[f64]>) -> Option<(Vec<Code>, [f64; 2])
             }
         }
     }
-    found.retain(|code| code.rows.len() >= OFTEN);
+    found.retain(|code| {
+        code.rows.len() >= OFTEN
+            && (is_code(code.value)
+                || others == Others::Short
+                || is_of_a_temperature(code, values, ends))
+    });
     if let Some(beside) = beside {
         let there = |row: &usize| {
             beside
                 .get(*row)
                 .copied()
-                .filter(|value| value.is_finite() && !is_code(*value))
+                .filter(|value| value.is_finite() && !may_be_code(*value))
         };
         let elsewhere = (0..values.len()).filter(|row| (low..=high).contains(&values[*row]));
         if let Some([low, high]) = range(elsewhere.filter_map(|row| there(&row))) {
@@ -129,4 +183,24 @@ fn codes(values: &[f64], beside: Option<&[f64]>) -> Option<(Vec<Code>, [f64; 2])
         }
     }
     (!found.is_empty()).then_some((found, ends))
+}
+
+/// Whether a value that may be a code is none that a temperature went to: far off, seldom, and there and back within a row.
+fn is_of_a_temperature(code: &Code, values: &[f64], [low, high]: [f64; 2]) -> bool {
+    let off = (code.value - high).max(low - code.value);
+    let is_reading = |value: &&f64| (low..=high).contains(*value);
+    let mut runs = code.rows.chunk_by(|row, next| row + 1 == *next);
+    let returns = |run: &[usize]| {
+        let (first, last) = (run[0], run[run.len() - 1]);
+        let before = values[..first].iter().rfind(is_reading);
+        let after = values[last + 1..].iter().find(is_reading);
+        // At an end of the recording only one of them is known.
+        let apart = before
+            .zip(after)
+            .map(|(before, after)| (after - before).abs());
+        apart.is_none_or(|apart| apart <= THERE_AND_BACK * off)
+    };
+    off > FAR_ALONE * (high - low)
+        && code.rows.len() as f64 <= SELDOM * values.len() as f64
+        && runs.all(returns)
 }

@@ -307,6 +307,7 @@ fn mapped(
     let mut table = table.mapped(&mapping)?;
     let used = used(model);
     let mut remarks = codes::leave_out(&mut table, &used, |name| partner(model, name));
+    remarks.extend(stamps::single_precision(&table));
     remarks.extend(stamps::spread(&mut table, &used));
     remarks.extend(absent.iter().map(|absent| absent.told.clone()));
     let recording = table.into_recording();

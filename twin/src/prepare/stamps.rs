@@ -3,7 +3,7 @@
 use recording::{Table, error::number, name::T_S};
 
 use super::series::median;
-use crate::report::format::{at_most, count};
+use crate::report::format::{at_most, count, grouped};
 
 /// Fewer whole runs than this tell of no rate.
 const FEWEST_RUNS: usize = 10;
@@ -16,6 +16,65 @@ const COMPLETE: f64 = 0.6;
 const MOVING: f64 = 0.5;
 /// A time until the next run that is this many times the usual one tells nothing of the rows before it.
 const USUAL: f64 = 1.5;
+
+/// Steps of a number of 24 bits that are this share of the mean time from row to row, or more, move rows against what they were.
+const COARSE: f64 = 0.1;
+/// Digits that were cut when a number of 24 bits was written, as a share of its step.
+const WRITTEN: f64 = 0.01;
+/// Times whose steps differ by less than this share of the number's own step are even: nothing was lost.
+const EVEN: f64 = 0.5;
+
+/// What is to be said of times that were numbers of 24 bits (single precision) once: of the time since 1970 those have steps of 128 s.
+pub(super) fn single_precision(table: &Table) -> Option<String> {
+    let times_s = table.column(T_S)?;
+    let ([first_s, ..], [.., last_s]) = (times_s, times_s) else {
+        return None;
+    };
+    let step_s = single_step(*last_s);
+    let mean_s = (last_s - first_s) / (times_s.len() - 1).max(1) as f64;
+    if times_s.len() < FEWEST_RUNS || mean_s <= 0.0 || step_s < COARSE * mean_s {
+        return None;
+    }
+    let is_single = |time_s: &f64| {
+        let off_s = (time_s - f64::from(*time_s as f32)).abs();
+        off_s <= WRITTEN * single_step(*time_s)
+    };
+    let mut steps = times_s.windows(2).map(|pair| pair[1] - pair[0]);
+    let usual_s = steps.next()?;
+    // Whole seconds, or a rate that such numbers hold exactly.
+    let is_even = steps.all(|step| (step - usual_s).abs() < EVEN * step_s);
+    if is_even || !times_s.iter().all(is_single) {
+        return None;
+    }
+    let repeats = times_s.windows(2).filter(|pair| pair[0] == pair[1]).count();
+    Some(format!(
+        "the times of {} look like numbers of single precision (24 bits), which around {} s are {} s apart: {} of {} rows have the time of \
+         the row before, and nothing that is shorter than that (a lag, a delay) can be told by them; expected double precision, or times \
+         that count from the start",
+        table.source(),
+        number(*last_s),
+        at_most(step_s, 4),
+        grouped(repeats),
+        grouped(times_s.len())
+    ))
+}
+
+/// What may have made a large time the same in every row.
+pub(super) fn held_by_single(time_s: f64) -> Option<String> {
+    let step_s = single_step(time_s);
+    (step_s >= 1.0 && time_s == f64::from(time_s as f32)).then(|| {
+        format!(
+            "numbers of single precision, 24 bits, are {} s apart there",
+            at_most(step_s, 4)
+        )
+    })
+}
+
+/// By how much the next number of single precision is larger.
+fn single_step(value: f64) -> f64 {
+    let single = value.abs() as f32;
+    f64::from(single.next_up()) - f64::from(single)
+}
 
 /// Spreads rows of one time stamp evenly until the next one, where stamps come in runs of much the same length; what was done, in words.
 ///
@@ -77,7 +136,7 @@ pub(super) fn spread(table: &mut Table, names: &[&str]) -> Option<String> {
         table.source(),
         count(usual as usize, "row"),
         at_most(usual_s, 4),
-        number(usual_s)
+        at_most(usual_s, 4)
     );
     table.replace(T_S, spread);
     Some(remark)
