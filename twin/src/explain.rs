@@ -346,11 +346,9 @@ fn tell(
         });
     }
     report.models.push(fitted(problem, &selection.fit));
-    report.remarks.extend(base_found(
-        &problem.name,
-        &selection.fit.model.nuisance,
-        &problem.base,
-    ));
+    report
+        .remarks
+        .extend(base_found(problem, &selection.fit.model.nuisance));
     report
         .remarks
         .extend(times_found(&read, &selection.fit, between));

@@ -399,3 +399,39 @@ fn two_zeros_of_one_sensor_are_said_to_contradict_each_other() {
         "{remarks}"
     );
 }
+
+/// A sensor without a fault and its reference, both logged in steps of 1 A: an error that does not fall is explained by nothing else.
+#[test]
+fn a_step_that_both_columns_have_explains_no_error_away() {
+    let folder = tempfile::tempdir().unwrap();
+    let model = "schema = 1\n[sensor]\nfront_end = \"pair\"\n";
+    fs::write(folder.path().join("m.toml"), model).unwrap();
+    let mut random = ChaCha8Rng::seed_from_u64(5);
+    let mut uniform = move || f64::from(random.next_u32()) / f64::from(u32::MAX);
+    let (mut current_a, mut target_a, mut left) = (0.0, 0.0, 0);
+    let mut rows = "t_s,i_ref_a,i_meas_a\n".to_owned();
+    for row in 0..3000 {
+        if left == 0 {
+            (left, target_a) = (5 + (75.0 * uniform()) as u32, 210.0 * uniform() - 60.0);
+        }
+        left -= 1;
+        current_a += 0.05 * (target_a - current_a);
+        let noise_a = 0.35 * (uniform() + uniform() - 1.0);
+        rows.push_str(&format!(
+            "{:.1},{current_a:.0},{:.0}\n",
+            0.1 * f64::from(row),
+            current_a + noise_a
+        ));
+    }
+    fs::write(folder.path().join("r.csv"), rows).unwrap();
+    assert_eq!(explained(folder.path(), &[]).status.code(), Some(0));
+    let report = fs::read(folder.path().join("out/report.json")).unwrap();
+    let report: serde_json::Value = serde_json::from_slice(&report).unwrap();
+    let summary = report["summary"].as_str().unwrap();
+    assert!(
+        summary.contains(
+            "no more than rounding both to the readings' step of 1 A makes (0.408 A rms)"
+        ) && !summary.contains('→'),
+        "{summary}"
+    );
+}

@@ -7,7 +7,7 @@ mod report_sample;
 use proptest::prelude::*;
 use serde_json::Value;
 use twin::report::{
-    data::{Form, OtherForm, Report, SignalPlots},
+    data::{Form, Known, OtherForm, Report, SignalPlots},
     html, json, text,
 };
 
@@ -279,6 +279,39 @@ fn a_note_is_told_in_full_where_there_is_room() {
     assert!(!screen.contains('…'), "{screen}");
     let words = screen.split_whitespace().collect::<Vec<_>>().join(" ");
     assert_eq!(words.matches("and what follows from it").count(), 2);
+}
+
+#[test]
+fn a_value_that_is_none_is_not_shown_as_one() {
+    let mut report = report_sample::explained();
+    let parameter = &mut report.effects[0].parameters[0];
+    (parameter.value, parameter.ci95) = (0.0, [0.0, 30.0]);
+    let name = parameter.name.clone();
+    let shown = |report: &Report, known: Known| {
+        let mut report = report.clone();
+        report.effects[0].parameters[0].known = known;
+        let json: Value = serde_json::from_str(&json::render(&report)).unwrap();
+        let said = json["effects"][0]["parameters"][0]["known"].clone();
+        (text::render(&report, 100), html::render(&report), said)
+    };
+    let (screen, page, said) = shown(&report, Known::Nothing);
+    assert!(
+        screen.contains(&format!("{name} not told (0 … 30)")),
+        "{screen}"
+    );
+    assert!(page.contains(&format!("{name}: not told (0 … 30)")));
+    assert_eq!(said, "nothing");
+    // At the end of what is searched it is that or more, and has no interval.
+    report.effects[0].parameters[0].value = 7198.5;
+    report.effects[0].parameters[0].ci95 = [514.0, 1e5];
+    let (screen, page, said) = shown(&report, Known::AtLeast);
+    assert!(
+        screen.contains(&format!("{name} 7198 s or more")),
+        "{screen}"
+    );
+    assert!(page.contains("7198 s or more") && !page.contains("514 …"));
+    assert_eq!(said, "at-least");
+    assert!(shown(&report, Known::Value).2.is_null());
 }
 
 #[test]

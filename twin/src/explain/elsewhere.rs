@@ -3,12 +3,13 @@
 use super::fit::fit;
 use super::held_out::held_out;
 use super::robust::loss;
-use super::select::{self, Selection, percent};
+use super::select::{self, Selection};
 use super::slope::BASE_OFF;
 use super::told::start_of;
 use super::workbench::{Model, Workbench};
 use crate::model::BEYOND_SOC;
 use crate::problem::{Base, Problem};
+use crate::report::format::percent;
 
 /// Standard uncertainty with which a start may be anywhere from empty to full.
 const ANYWHERE: f64 = 1.0 / BASE_OFF;

@@ -8,10 +8,11 @@
 use super::fit::{self, Fit, ahead_of_grid};
 use super::flexible::Features;
 use super::normal::{dot, normal, solve};
-use super::select::{self, Selection, percent};
+use super::select::{self, Selection};
 use super::slope::change;
 use super::workbench::Workbench;
 use crate::problem::{Base, View};
+use crate::report::format::percent;
 
 /// Knots of the free curve, at even shares of the rows.
 const KNOTS: usize = 16;

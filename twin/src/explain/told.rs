@@ -3,17 +3,18 @@
 use super::fit::Fit;
 use super::flexible::Explainable;
 use super::intervals::Reported;
-use super::select::{Selection, percent, stands_at_top};
+use super::select::{Selection, stands_at_top};
 use super::slope::{BASE_OFF, at_base_end};
 use super::workbench::{Member, Workbench};
 use super::{Nuisance, locate, rms};
 use crate::effects::ocv::bend_v;
 use crate::effects::{CurrentError, find};
-use crate::problem::{Base, Problem};
+use crate::problem::{Base, Problem, View};
 use crate::report::data::{
-    EffectReport, FittedModel, Location, LocationKind, ParameterReport, Report, SignalPlots,
+    EffectReport, FittedModel, Known, Location, LocationKind, ParameterReport, Report, SignalPlots,
     Verdict,
 };
+use crate::report::format::{at_most, percent, quantity};
 use crate::spectrum;
 
 /// What a battery is found to be off by is told from here on, in %.
@@ -26,6 +27,11 @@ const TOLD_ZERO: f64 = 0.1;
 const TOLD_STEP: f64 = 0.05;
 /// What the model file leaves open is in the verdict's sentence if it makes the error smaller by this factor.
 const NOT_AS_STATED: f64 = 1.5;
+/// A held-out error that falls to this share of what it was, or less, has fallen.
+const UNCHANGED: f64 = 0.99;
+/// A change of the resistance that moves the voltage by less than this share of the stated noise (rms) shows in no drive: a thousand
+/// readings tell it to no more than its own size.
+const HIDDEN: f64 = 0.02;
 /// Share of what is in a band of frequency from which on an effect reaches it.
 const REACHES: f64 = 0.1;
 
@@ -83,7 +89,7 @@ pub(super) fn attribute(bench: &Workbench<'_>, fit: &Fit, locations: &mut [Locat
 /// The unit of a parameter in this problem: `A` in the effects table stands for the view's unit.
 fn unit(problem: &Problem, unit: &str) -> String {
     match problem.view {
-        crate::problem::View::Sensor if problem.unit != "A" => unit.replace('A', &problem.unit),
+        View::Sensor if problem.unit != "A" => unit.replace('A', &problem.unit),
         _ => unit.to_owned(),
     }
 }
@@ -116,6 +122,13 @@ pub(super) fn effects(
                         ci95: [if unsigned { from.max(0.0) } else { from }, to],
                         off: Some(parameter.off).filter(|off| off.is_finite()),
                         unit: unit(bench.problem, parameter.unit),
+                        known: if reported.unmoved.contains(&(named.index, p)) {
+                            Known::Nothing
+                        } else if stands_at_top(bench, member, p) {
+                            Known::AtLeast
+                        } else {
+                            Known::Value
+                        },
                     }
                 })
                 .collect();
@@ -158,12 +171,11 @@ pub(super) fn not_told(
         let (member, [low, high]) = (&members[m], reported.ci95[m][p]);
         let parameter = &member.effect.card().parameters[p];
         format!(
-            "{name}: {} of {} is not told: with anything from {} to {} {} the simulation is the same to within noise, and {} is only where the search stood",
+            "{name}: {} of {} is not told: with anything from {} to {} the simulation is the same to within noise, and {} is only where the search stood",
             parameter.name,
             member.id(),
             short(low),
-            short(high),
-            unit(bench.problem, parameter.unit),
+            quantity(&short(high), &unit(bench.problem, parameter.unit)),
             short(member.values[p])
         )
     });
@@ -182,11 +194,10 @@ pub(super) fn not_told(
             .filter(|(p, _)| stands_at_top(bench, member, *p))
             .map(|(p, parameter)| {
                 format!(
-                    "{name}: {} of {} stands at the end of what is searched, {} {}: it is that or more, and the intervals of this effect hold for that value alone",
+                    "{name}: {} of {} stands at the end of what is searched, {}: it is that or more, and the intervals of this effect hold for that value alone",
                     parameter.name,
                     member.id(),
-                    short(member.values[p]),
-                    unit(bench.problem, parameter.unit)
+                    quantity(&short(member.values[p]), &unit(bench.problem, parameter.unit)),
                 )
             })
     });
@@ -289,10 +300,28 @@ pub(super) fn sentence(
             signal.unit
         )
     });
+    let steps = only_steps(bench, selection, report);
     match verdict {
+        Verdict::Explained if let Some(steps) = &steps => {
+            format!("{name}: {steps}, and by nothing else.")
+        }
+        Verdict::PartlyExplained
+            if let Some(steps) = &steps
+                && left.is_real() =>
+        {
+            format!(
+                "{name}: {steps}; structure is left in that, {} of it within reach of the recorded inputs.",
+                percent(left.share)
+            )
+        }
+        Verdict::Ambiguous
+            if let Some(steps) = &steps
+                && doubted =>
+        {
+            format!("{name}: {steps}; what is smaller than the steps this recording does not tell.")
+        }
         Verdict::NoMismatch
-            if let Some(found) =
-                base_differs(&selection.fit.model.nuisance, &bench.problem.base)
+            if let Some(found) = base_differs(bench.problem, &selection.fit.model.nuisance)
                 && report.signals.last().is_some_and(|signal| {
                     signal.rmse_before > NOT_AS_STATED * signal.rmse_after
                 }) =>
@@ -353,11 +382,35 @@ pub(super) fn sentence(
     }
 }
 
+/// What is to be said where the only thing named is the step of the readings, and the simulation moves by it already (the reference is read
+/// in the same one): an error that does not fall is not explained by anything, and is no larger than rounding makes it.
+fn only_steps(bench: &Workbench<'_>, selection: &Selection, report: &Report) -> Option<String> {
+    let [named] = selection.named.as_slice() else {
+        return None;
+    };
+    let member = &selection.fit.model.members[named.index];
+    let step = member.values.first().filter(|_| member.effect.rounds())?;
+    let signal = report.signals.last()?;
+    let (before, after) = (signal.held_out_blocks_before, signal.held_out_blocks_after);
+    // Rounding errors are spread evenly over a step; those of readings and reference are two.
+    let both = step * (2.0 / 12.0_f64).sqrt();
+    (after >= UNCHANGED * before && after <= both).then(|| {
+        let unit = &bench.problem.unit;
+        format!(
+            "recording and simulation differ by {}, no more than rounding both to the readings' step of {} makes ({} rms)",
+            quantity(&short(after), unit),
+            quantity(&at_most(*step, 4), unit),
+            quantity(&short(both), unit)
+        )
+    })
+}
+
 /// What was found of a battery within what the model file leaves open: it is no physics that was left out, and part of every error
 /// after it.
-pub(super) fn base_found(name: &str, nuisance: &Nuisance, base: &Base) -> Option<String> {
-    base_differs(nuisance, base).map(|found| {
-        if at_limit(nuisance, base) {
+pub(super) fn base_found(problem: &Problem, nuisance: &Nuisance) -> Option<String> {
+    let name = &problem.name;
+    base_differs(problem, nuisance).map(|found| {
+        if at_limit(nuisance, &problem.base) {
             format!(
                 "{name}: {found} than stated is as far as the model file allows ({BASE_OFF} standard uncertainties), and more would fit \
                  better: what is stated is off by more, or something else makes it look so; the errors after are with that"
@@ -388,8 +441,8 @@ pub(super) fn start_of(operation: usize) -> String {
 }
 
 /// By what the battery as designed differs, if by as much as is told.
-fn base_differs(nuisance: &Nuisance, base: &Base) -> Option<String> {
-    let Base::Battery(base) = base else {
+fn base_differs(problem: &Problem, nuisance: &Nuisance) -> Option<String> {
+    let Base::Battery(base) = &problem.base else {
         return None;
     };
     let by = |share: f64, what: &str, unit: &str| {
@@ -431,7 +484,15 @@ fn base_differs(nuisance: &Nuisance, base: &Base) -> Option<String> {
             )
         });
     let found: Vec<String> = [
-        by(nuisance.resistance, "the ohmic resistance", "%"),
+        by(
+            if tells_resistance(problem, nuisance.resistance) {
+                nuisance.resistance
+            } else {
+                0.0
+            },
+            "the ohmic resistance",
+            "%",
+        ),
         by(shift, &start, "points of per cent"),
         zero,
         bend,
@@ -440,6 +501,16 @@ fn base_differs(nuisance: &Nuisance, base: &Base) -> Option<String> {
     .flatten()
     .collect();
     (!found.is_empty()).then(|| found.join(" and "))
+}
+
+/// Whether the recorded current is large enough for this change of the ohmic resistance to show. In a parked car's log the resistance is
+/// found by what else is open, and is none to drive with.
+fn tells_resistance(problem: &Problem, change: f64) -> bool {
+    let Base::Battery(base) = &problem.base else {
+        return true;
+    };
+    let current_a = rms(problem.drive.reference.iter().copied());
+    (change * base.resistance_ohm * current_a).abs() >= HIDDEN * problem.noise
 }
 
 /// What is to be said of readings behind what the model file says is at the end of the chain, or that do not come through it.
@@ -594,6 +665,10 @@ fn zero_hint(problem: &Problem) -> Option<String> {
 
 /// What is written into the extended model file.
 pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
+    let mut nuisance = fit.model.nuisance.clone();
+    if !tells_resistance(problem, nuisance.resistance) {
+        nuisance.resistance = 0.0;
+    }
     let values = |member: &Member| {
         let names = member
             .effect
@@ -611,19 +686,23 @@ pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
             .iter()
             .map(|member| (member.id().to_owned(), values(member)))
             .collect(),
-        nuisance: fit.model.nuisance.clone(),
+        nuisance,
         of_battery: matches!(problem.base, Base::Battery(_)),
         smooth_reference: matches!(&problem.base, Base::Sensor(base) if base.smooth_reference),
         current_holds: problem.drive.holds,
     }
 }
 
-/// Three digits.
+/// Three digits; with a power of ten where there would be many zeros. A time since 1970 stays what it is.
 pub(super) fn short(value: f64) -> String {
     if value == 0.0 || !value.is_finite() {
         return format!("{value}");
     }
-    let digits = 2 - value.abs().log10().floor() as i32;
+    let exponent = value.abs().log10().floor() as i32;
+    if !(-7..12).contains(&exponent) {
+        return format!("{value:.2e}");
+    }
+    let digits = 2 - exponent;
     format!("{value:.*}", digits.clamp(0, 12) as usize)
 }
 
@@ -633,6 +712,49 @@ mod tests {
     use super::*;
     use crate::problem::BatteryBase;
 
+    /// A cell of 20 mΩ with readings to 1 mV, and a current.
+    fn battery(current_a: f64) -> Problem {
+        let t_s: Vec<f64> = (0..100).map(f64::from).collect();
+        let rows = t_s.len();
+        let mut problem = Problem::pair(t_s, vec![current_a; rows], vec![3.7; rows], 0.001);
+        problem.view = View::Voltage;
+        problem.name = "v_cell_v".into();
+        problem.base = Base::Battery(BatteryBase {
+            resistance_ohm: 0.02,
+            initial_soc_sigma: vec![0.01],
+            resistance_sigma: 0.1,
+            ..BatteryBase::default()
+        });
+        problem
+    }
+
+    #[test]
+    fn a_resistance_is_not_told_by_a_current_that_does_not_show_it() {
+        let nuisance = Nuisance {
+            resistance: -0.0955,
+            soc_shift: vec![0.0],
+            ..Nuisance::default()
+        };
+        let driven = base_found(&battery(2.0), &nuisance).unwrap();
+        assert!(driven.contains("resistance 9.55 % lower"), "{driven}");
+        // 2 mA make 4 µV of it.
+        assert_eq!(base_found(&battery(0.002), &nuisance), None);
+    }
+
+    #[test]
+    fn numbers_are_as_long_as_they_tell() {
+        for (value, said) in [
+            (0.0502, "0.0502"),
+            (12.345, "12.3"),
+            (1_700_000_904.3, "1700000904"),
+            (3.45e-7, "0.000000345"),
+            (1.2e-13, "1.20e-13"),
+            (2.027e21, "2.03e21"),
+        ] {
+            assert_eq!(short(value), said);
+        }
+    }
+
     #[test]
     fn what_a_battery_was_off_by_is_told_if_it_matters() {
         let found = |resistance, soc_shift| {
@@ -641,12 +763,7 @@ mod tests {
                 soc_shift: vec![soc_shift],
                 ..Nuisance::default()
             };
-            let base = Base::Battery(BatteryBase {
-                initial_soc_sigma: vec![0.01],
-                resistance_sigma: 0.1,
-                ..BatteryBase::default()
-            });
-            base_found("v_cell_v", &nuisance, &base)
+            base_found(&battery(2.0), &nuisance)
         };
         assert_eq!(found(4e-4, -4e-4), None);
         let said = found(0.273, -0.0071).unwrap();

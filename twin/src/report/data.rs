@@ -154,6 +154,25 @@ pub struct Location {
     pub effect: Option<String>,
 }
 
+/// What the recording tells of a parameter.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Known {
+    /// Its value.
+    #[default]
+    Value,
+    /// That it is this or more: it stands at the end of what is searched.
+    AtLeast,
+    /// Nothing: with anything in its interval the simulation is the same.
+    Nothing,
+}
+
+impl Known {
+    fn is_value(&self) -> bool {
+        *self == Self::Value
+    }
+}
+
 /// A parameter of an effect.
 #[derive(Clone, Debug, Serialize)]
 pub struct ParameterReport {
@@ -168,6 +187,9 @@ pub struct ParameterReport {
     /// The value that turns the effect off, if a finite one does.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub off: Option<f64>,
+    /// What of it is known, if that is not its value.
+    #[serde(skip_serializing_if = "Known::is_value")]
+    pub known: Known,
 }
 
 /// A named effect.

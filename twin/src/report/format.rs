@@ -1,6 +1,6 @@
 //! Numbers, places and verdicts in words, the same on the page and on the terminal.
 
-use super::data::{Location, LocationKind, Report, Verdict};
+use super::data::{Known, Location, LocationKind, ParameterReport, Report, Verdict};
 
 /// What stands for a number that there is none of.
 pub const NONE: &str = "–";
@@ -70,6 +70,20 @@ pub fn with_interval(value: f64, interval: [f64; 2]) -> [String; 3] {
     }
     let decimals = (-place).max(0) as usize;
     [value, low, high].map(|number| minus(format!("{number:.decimals$}")))
+}
+
+/// A parameter's value with its unit, and the ends of its interval: where the search stood is no value that was found, and beside
+/// "or more" there is no interval.
+pub fn found(parameter: &ParameterReport) -> (String, Option<[String; 2]>) {
+    let [value, low, high] = with_interval(parameter.value, parameter.ci95);
+    match parameter.known {
+        Known::Value => (quantity(&value, &parameter.unit), Some([low, high])),
+        Known::Nothing => ("not told".to_owned(), Some([low, high])),
+        Known::AtLeast => {
+            let least = quantity(&significant(parameter.value, 3), &parameter.unit);
+            (format!("{least} or more"), None)
+        }
+    }
 }
 
 /// `number unit`; a number without unit stays bare.

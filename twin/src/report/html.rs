@@ -1,10 +1,10 @@
 //! The report as one page that needs nothing else: no network, no other file.
 
 use super::{
-    data::{EffectReport, Location, ParameterReport, Report, SignalReport, Verdict},
+    data::{EffectReport, Known, Location, ParameterReport, Report, SignalReport, Verdict},
     format::{
-        change, count, grouped, meaning, p_value, percent, place, quantity, significant, unit_of,
-        verdict, with_interval,
+        NONE, change, count, found, grouped, meaning, p_value, percent, place, quantity,
+        significant, unit_of, verdict,
     },
     plots::{Pictures, Words, embed, pictures},
 };
@@ -225,12 +225,12 @@ fn answer(page: &mut String, report: &Report) {
 }
 
 fn in_words(parameter: &ParameterReport) -> String {
-    let [value, low, high] = with_interval(parameter.value, parameter.ci95);
-    format!(
-        "{} = {} ({low} … {high})",
-        parameter.name,
-        quantity(&value, &parameter.unit)
-    )
+    let name = &parameter.name;
+    match (found(parameter), parameter.known) {
+        ((value, Some([low, high])), Known::Nothing) => format!("{name}: {value} ({low} … {high})"),
+        ((value, Some([low, high])), _) => format!("{name} = {value} ({low} … {high})"),
+        ((value, None), _) => format!("{name} = {value}"),
+    }
 }
 
 /// A share as a bar with its number.
@@ -330,13 +330,14 @@ fn one_effect(page: &mut String, number: usize, effect: &EffectReport) {
              <th scope=\"col\" class=\"n\">95 % interval</th><th scope=\"col\">Interval, and where the effect is off</th></tr></thead>\n<tbody>\n",
         );
         for parameter in &effect.parameters {
-            let [value, low, high] = with_interval(parameter.value, parameter.ci95);
+            let (value, ends) = found(parameter);
+            let ends = ends.map_or(NONE.to_owned(), |[low, high]| {
+                format!("{low} … {}", escape(&quantity(&high, &parameter.unit)))
+            });
             page.push_str(&format!(
-                "<tr><th scope=\"row\">{}</th><td class=\"n\" data-label=\"Value\">{}</td><td class=\"n\" data-label=\"95 % interval\">{} … {}</td><td class=\"wide\">{}</td></tr>\n",
+                "<tr><th scope=\"row\">{}</th><td class=\"n\" data-label=\"Value\">{}</td><td class=\"n\" data-label=\"95 % interval\">{ends}</td><td class=\"wide\">{}</td></tr>\n",
                 code(&parameter.name),
-                escape(&quantity(&value, &parameter.unit)),
-                low,
-                escape(&quantity(&high, &parameter.unit)),
+                escape(&value),
                 interval(parameter),
             ));
         }
@@ -424,6 +425,9 @@ fn evidence(page: &mut String, effect: &EffectReport) {
 fn interval(parameter: &ParameterReport) -> String {
     let [low, high] = parameter.ci95;
     let value = parameter.value;
+    if parameter.known == Known::AtLeast {
+        return "<span class=\"gap\">the end of what is searched</span>".to_owned();
+    }
     if ![low, high, value].iter().all(|v| v.is_finite()) || high < low {
         return "<span class=\"gap\">not bounded</span>".to_owned();
     }
@@ -452,11 +456,17 @@ fn interval(parameter: &ParameterReport) -> String {
         ));
     }
     drawing.push_str(&format!(
-        "<span class=\"range\" style=\"left:{:.2}%;width:{:.2}%\"></span><span class=\"dot\" style=\"left:{:.2}%\"></span></span>",
+        "<span class=\"range\" style=\"left:{:.2}%;width:{:.2}%\"></span>",
         at(low),
-        at(high) - at(low),
-        at(value)
+        at(high) - at(low)
     ));
+    if parameter.known == Known::Value {
+        let dot = at(value);
+        drawing.push_str(&format!(
+            "<span class=\"dot\" style=\"left:{dot:.2}%\"></span>"
+        ));
+    }
+    drawing.push_str("</span>");
     drawing
 }
 

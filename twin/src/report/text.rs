@@ -3,8 +3,8 @@
 use super::{
     data::{EffectReport, ParameterReport, Report},
     format::{
-        change, count, meaning, p_value, percent, place, quantity, significant, unit_of, verdict,
-        with_interval,
+        change, count, found, meaning, p_value, percent, place, quantity, significant, unit_of,
+        verdict,
     },
 };
 
@@ -194,9 +194,11 @@ fn effects(report: &Report, width: usize, fullness: Fullness) -> Vec<String> {
 }
 
 fn parameter(parameter: &ParameterReport) -> String {
-    let [value, low, high] = with_interval(parameter.value, parameter.ci95);
-    let value = quantity(&value, &parameter.unit);
-    format!("{} {value} ({low} … {high})", parameter.name)
+    let name = &parameter.name;
+    match found(parameter) {
+        (value, Some([low, high])) => format!("{name} {value} ({low} … {high})"),
+        (value, None) => format!("{name} {value}"),
+    }
 }
 
 fn confused(effect: &EffectReport, width: usize, fullness: Fullness) -> Vec<String> {

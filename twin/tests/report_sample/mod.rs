@@ -7,7 +7,7 @@ use rand_chacha::{
     rand_core::{Rng, SeedableRng},
 };
 use twin::report::data::{
-    EffectReport, HoldoutReport, Inputs, Location, LocationKind, ParameterReport, Report,
+    EffectReport, HoldoutReport, Inputs, Known, Location, LocationKind, ParameterReport, Report,
     SignalPlots, SignalReport, Unexplained, Verdict,
 };
 
@@ -160,6 +160,7 @@ fn parameter(name: &str, value: f64, half: f64, unit: &str, off: f64) -> Paramet
         ci95: [value - half, value + 1.1 * half],
         unit: unit.to_owned(),
         off: Some(off),
+        known: Known::Value,
     }
 }
 
