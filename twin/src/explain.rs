@@ -6,7 +6,7 @@
 //! [`held_out`] says what a fit is worth on rows that it was not made of, and [`select`] decides. [`intervals`] and [`locate`] say how
 //! sure and where; `trust`, [`shape`] and `unfitted` take back names that the recording or other files do not bear out, `strays`
 //! looks at readings that no noise makes, `dropout` at stretches that no physics makes, `verdict` says what that makes (`quieter`: whether what works between the rows only evens
-//! out noise of the reference), `elsewhere` whether another start would do the same, `form` which simple form what is left has, and `told` puts the report together.
+//! out noise of the reference), `elsewhere` whether another start would do the same, `form` which simple form what is left has, `scattered` whether it is that of moments that scatter, and `told` puts the report together.
 //! Nothing here knows a file or an effect by name.
 
 mod apart;
@@ -25,6 +25,7 @@ pub mod locate;
 pub mod normal;
 mod quieter;
 pub mod robust;
+mod scattered;
 pub mod screen;
 pub mod select;
 pub mod shape;
@@ -334,6 +335,8 @@ fn tell(
     let mut form = None;
     if leaves_something {
         form = form::form(&read, &shown.residual, stated.unwrap_or(0.0));
+        let scattered = scattered::scattered(&read, &shown.residual).filter(|_| form.is_none());
+        report.remarks.extend(scattered);
         let place = locate::locate(&read, &shown.residual, options.seed)
             .into_iter()
             .next();

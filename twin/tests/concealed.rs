@@ -179,6 +179,52 @@ fn single_readings_far_beyond_noise_are_no_agreement() {
     assert!(said.contains("3 readings") && said.contains(" A"), "{said}");
 }
 
+/// A sensor that is right, in messages that wait for their turn on a bus: no effect of the library, and nothing with a course.
+#[test]
+fn moments_that_scatter_are_told() {
+    /// Five minutes of the drive.
+    const FEW: usize = 3000;
+    let truth = truth();
+    let remark = |reading: Vec<f64>, seed: u64, noise_a: f64, without: &[&str]| {
+        let mut noise = noise(seed, noise_a);
+        let [t_s, current_a] = [&truth.t_s, &truth.current_a].map(|series| series[..FEW].to_vec());
+        let reading_a = reading[..FEW].iter().map(|y| y + noise()).collect();
+        let report = said(sensor(t_s, current_a, reading_a, NOISE_A), seed, without);
+        let mut remarks = report.remarks.into_iter();
+        let found = remarks.find(|said| said.contains("a moment of its own"));
+        (found, report.summary)
+    };
+    let waits_to_s = 0.06;
+    let mut random = noise(160, 1.0);
+    // As far about half of it as waits are that may be any up to the longest.
+    let mut waits_s = || waits_to_s * (0.5 + random() / 12.0_f64.sqrt()).max(0.0);
+    let late = (0..ROWS).map(|row| {
+        let (before, here) = (truth.current_a[row.saturating_sub(1)], truth.current_a[row]);
+        here - (here - before) * waits_s() / STEP_S
+    });
+    let (told, summary) = remark(late.collect(), 60, NOISE_A, &[]);
+    let told = told.unwrap_or_else(|| panic!("{summary}"));
+    let seconds = |then: &str| -> f64 {
+        let (before, _) = told.split_once(then).unwrap();
+        before.rsplit(' ').next().unwrap().parse().unwrap()
+    };
+    let uniform_s = waits_to_s / 12.0_f64.sqrt();
+    assert!(
+        (seconds(" s (rms)") / uniform_s - 1.0).abs() < 0.1,
+        "{told}"
+    );
+    let mean_s = 0.5 * waits_to_s;
+    assert!(
+        (seconds(" s earlier") / mean_s - 1.0).abs() < 0.05,
+        "{told}"
+    );
+    // Louder noise is no such thing, nor what another effect leaves.
+    let louder = remark(truth.current_a.clone(), 62, 3.0 * NOISE_A, &[]);
+    assert_eq!(louder.0, None, "{}", louder.1);
+    let lag = remark(lagged(&truth, 0.3), 63, NOISE_A, &["lag"]);
+    assert_eq!(lag.0, None, "{}", lag.1);
+}
+
 #[test]
 fn a_zero_error_and_a_sensitivity_error() {
     let truth = truth();
