@@ -411,9 +411,8 @@ pub trait Effect: Sync {
     /// Whether it is one of the plainest there are: exact, with a size and nothing else, at the row (a factor, a constant).
     fn is_plainest(&self) -> bool {
         let card = self.card();
-        let size =
-            |parameters: &[Parameter]| matches!(parameters, [one] if one.search == Search::Linear);
-        self.idealised() == 0.0 && !card.stage.is_between_rows() && size(card.parameters)
+        let is_size = matches!(card.parameters, [one] if one.search == Search::Linear);
+        self.idealised() == 0.0 && !card.stage.is_between_rows() && is_size
     }
 
     /// Whether the loss has a kink in a parameter (an end, a threshold, the start of a window): its interval is then found by

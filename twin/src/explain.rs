@@ -335,8 +335,10 @@ fn tell(
     let mut form = None;
     if leaves_something {
         form = form::form(&read, &shown.residual, stated.unwrap_or(0.0));
-        let scattered = scattered::scattered(&read, &shown.residual).filter(|_| form.is_none());
-        report.remarks.extend(scattered);
+        if form.is_none() {
+            let scattered = scattered::scattered(&read, &shown.residual);
+            report.remarks.extend(scattered);
+        }
         let place = locate::locate(&read, &shown.residual, options.seed)
             .into_iter()
             .next();

@@ -23,7 +23,7 @@ const LEAST_BLOCKS: usize = 2 * FOLDS;
 /// takes nine tenths of many a random walk.
 const TOLD: f64 = 0.95;
 /// What is left is beyond the noise from this share of the noise's energy on.
-const BEYOND: f64 = 0.2;
+pub(super) const BEYOND: f64 = 0.2;
 /// Two forms are told apart by the sum of what one is better by, block by block, from so many of its standard deviations on.
 const APART: f64 = 2.0;
 /// Rows that a stretch of a variable has at least, of which a form has a value of its own.

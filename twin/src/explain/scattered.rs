@@ -5,6 +5,8 @@
 //! A mean d of all δt and their spread j are fitted by maximum likelihood to residuals r with variance n² + j²·s² about d·s, with n the stated
 //! noise and s the slope of the simulation as designed.
 
+use super::form::BEYOND;
+use super::normal::dot;
 use super::rms;
 use super::told::short;
 use super::workbench::Workbench;
@@ -14,8 +16,6 @@ use crate::problem::View;
 const LEAST_ROWS: usize = 200;
 /// Scatter and mean are what is left if they make at least this share of its energy beyond the stated noise.
 const MOST: f64 = 0.8;
-/// What is left is beyond the noise from this share of the noise's energy on.
-const BEYOND: f64 = 0.2;
 /// Parts of the rows by how fast the current moves, in each of which the variance has to be as it is said, …
 const PARTS: usize = 6;
 /// … to this factor.
@@ -24,8 +24,11 @@ const AS_SAID: f64 = 1.5;
 const ALONE: f64 = 0.2;
 /// The mean moment is told from so many standard errors on.
 const TOLD: f64 = 4.0;
-/// Turns in which mean and spread are fitted to each other; halvings of the spread's range.
+/// Turns in which mean and spread are fitted to each other.
 const TURNS: usize = 8;
+/// The squared spread is looked for below this many times what all that is left would come to if it were nothing but scatter, …
+const AT_MOST: f64 = 4.0;
+/// … whose range is halved so often.
 const HALVINGS: usize = 60;
 
 /// What is to be said of a residual as it was read.
@@ -37,6 +40,7 @@ pub(super) fn scattered(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strin
     let up_to: Vec<f64> = (0..residual.len())
         .map(|row| bench.slope_per_s(row))
         .collect();
+    // Beyond the last row there is none, as up to the first.
     let mut from = up_to.clone();
     from.rotate_left(1);
     let about = up_to
@@ -53,7 +57,7 @@ pub(super) fn scattered(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strin
         ..
     } = found
         .filter_map(|slopes| moments(residual, &slopes, problem.noise))
-        .max_by(|one, other| one.likelihood.total_cmp(&other.likelihood))?;
+        .max_by(|one, other| one.log_likelihood.total_cmp(&other.log_likelihood))?;
     let name = &problem.name;
     let mean = if mean_s.abs() > TOLD * uncertain_s {
         format!(
@@ -74,27 +78,23 @@ pub(super) fn scattered(bench: &Workbench<'_>, residual: &[f64]) -> Option<Strin
     ))
 }
 
-/// Moments that readings stand for, from their rows' on.
+/// Moments that readings stand for, from their rows' on: their mean with its standard error, and their spread about it, rms.
 #[derive(Debug)]
 struct Moments {
     mean_s: f64,
     uncertain_s: f64,
     spread_s: f64,
-    /// Logarithm of it.
-    likelihood: f64,
+    log_likelihood: f64,
 }
 
 /// Fitted to residuals with their slopes, in units per second, and white noise; `None` if that is not what is left.
 fn moments(residual: &[f64], slopes: &[f64], noise: f64) -> Option<Moments> {
     let quiet = noise * noise;
     let pairs = || residual.iter().zip(slopes);
-    let energy: f64 = residual.iter().map(|r| r * r).sum();
-    let beyond = energy - quiet * residual.len() as f64;
-    let moves: f64 = slopes.iter().map(|s| s * s).sum();
-    if residual.len() < LEAST_ROWS
-        || beyond <= BEYOND * quiet * residual.len() as f64
-        || moves <= 0.0
-    {
+    let (energy, moves) = (dot(residual, residual), dot(slopes, slopes));
+    let stated = quiet * residual.len() as f64;
+    let beyond = energy - stated;
+    if residual.len() < LEAST_ROWS || beyond <= BEYOND * stated || moves <= 0.0 {
         return None;
     }
     let (mut mean_s, mut squared, mut information) = (0.0, beyond / moves, 0.0);
@@ -112,7 +112,7 @@ fn moments(residual: &[f64], slopes: &[f64], noise: f64) -> Option<Moments> {
                 .sum::<f64>()
                 > 0.0
         };
-        let (mut low, mut high) = (0.0, 4.0 * energy / moves);
+        let (mut low, mut high) = (0.0, AT_MOST * energy / moves);
         for _ in 0..HALVINGS {
             let middle = 0.5 * (low + high);
             if rises(middle) {
@@ -131,7 +131,7 @@ fn moments(residual: &[f64], slopes: &[f64], noise: f64) -> Option<Moments> {
         .collect();
     let all: f64 = errors.iter().map(|(_, error)| error * error).sum();
     let variances = slopes.iter().map(|s| (quiet + squared * s * s).ln());
-    let likelihood = -0.5 * (all + variances.sum::<f64>());
+    let log_likelihood = -0.5 * (all + variances.sum::<f64>());
     let together: f64 = errors.windows(2).map(|pair| pair[0].1 * pair[1].1).sum();
     if together.abs() > ALONE * all {
         return None;
@@ -145,6 +145,6 @@ fn moments(residual: &[f64], slopes: &[f64], noise: f64) -> Option<Moments> {
         mean_s,
         uncertain_s: information.sqrt().recip(),
         spread_s: squared.sqrt(),
-        likelihood,
+        log_likelihood,
     })
 }

@@ -27,7 +27,7 @@ const TOLD_ZERO: f64 = 0.1;
 const TOLD_STEP: f64 = 0.05;
 /// What the model file leaves open is in the verdict's sentence if it makes the error smaller by this factor.
 const NOT_AS_STATED: f64 = 1.5;
-/// A held-out error that falls to this share of what it was, or less, has fallen.
+/// A held-out error that is this share of what it was, or more, has not fallen.
 const UNCHANGED: f64 = 0.99;
 /// A change of the resistance that moves the voltage by less than this share of the stated noise (rms) shows in no drive: a thousand
 /// readings tell it to no more than its own size.
@@ -485,11 +485,7 @@ fn base_differs(problem: &Problem, nuisance: &Nuisance) -> Option<String> {
         });
     let found: Vec<String> = [
         by(
-            if tells_resistance(problem, nuisance.resistance) {
-                nuisance.resistance
-            } else {
-                0.0
-            },
+            resistance_told(problem, nuisance),
             "the ohmic resistance",
             "%",
         ),
@@ -503,14 +499,16 @@ fn base_differs(problem: &Problem, nuisance: &Nuisance) -> Option<String> {
     (!found.is_empty()).then(|| found.join(" and "))
 }
 
-/// Whether the recorded current is large enough for this change of the ohmic resistance to show. In a parked car's log the resistance is
-/// found by what else is open, and is none to drive with.
-fn tells_resistance(problem: &Problem, change: f64) -> bool {
+/// The change of the ohmic resistance, as a share of it, if the recorded current is large enough for it to show, and none otherwise. In a
+/// parked car's log the resistance is found by what else is open, and is none to drive with.
+fn resistance_told(problem: &Problem, nuisance: &Nuisance) -> f64 {
+    let change = nuisance.resistance;
     let Base::Battery(base) = &problem.base else {
-        return true;
+        return change;
     };
     let current_a = rms(problem.drive.reference.iter().copied());
-    (change * base.resistance_ohm * current_a).abs() >= HIDDEN * problem.noise
+    let shows = (change * base.resistance_ohm * current_a).abs() >= HIDDEN * problem.noise;
+    if shows { change } else { 0.0 }
 }
 
 /// What is to be said of readings behind what the model file says is at the end of the chain, or that do not come through it.
@@ -665,10 +663,10 @@ fn zero_hint(problem: &Problem) -> Option<String> {
 
 /// What is written into the extended model file.
 pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
-    let mut nuisance = fit.model.nuisance.clone();
-    if !tells_resistance(problem, nuisance.resistance) {
-        nuisance.resistance = 0.0;
-    }
+    let nuisance = Nuisance {
+        resistance: resistance_told(problem, &fit.model.nuisance),
+        ..fit.model.nuisance.clone()
+    };
     let values = |member: &Member| {
         let names = member
             .effect

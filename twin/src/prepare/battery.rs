@@ -306,7 +306,7 @@ pub(super) fn out_of_charge(problem: &Problem) -> Option<String> {
 }
 
 /// A current that empties a cell in an hour takes this many times its open-circuit voltage, or more, over its resistance: that of no
-/// cell does (a coin cell's comes near once), and one that is stated in thousandths makes fifteen times.
+/// vehicle's cell does (the 18650 of the recordings, 2.81 Ah and 22.5 mΩ, takes 1.5 % of it), and one that is stated in thousandths makes fifteen times.
 const NO_CELL: f64 = 2.0;
 
 /// What is to be said of a capacity and a resistance that no cell has together.

@@ -1,4 +1,4 @@
-//! Time stamps that are coarser than the rows: several rows in a row say the same time.
+//! Time stamps that are coarser than the rows: several rows in a row say the same time, or they were numbers of single precision.
 
 use recording::{Table, error::number, name::T_S};
 

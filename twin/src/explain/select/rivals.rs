@@ -117,6 +117,7 @@ fn nearest(
 /// Models with two effects in the place of one that may stand for them; `without` has none of the three. Over currents that hardly
 /// move any curve may stand for a straight line, a factor with a constant.
 fn of_two(bench: &Workbench<'_>, without: &Fit, one: &'static dyn Effect) -> Vec<Model> {
+    // What a battery's voltage does has a memory: no line stands for it.
     let bends = matches!(bench.problem.base, Base::Sensor(_))
         && one.idealised() > 0.0
         && !one.card().stage.is_between_rows();
