@@ -1,13 +1,8 @@
 //! Bad input: one clear sentence that says where, what and what was expected; exit code 2; nothing left behind.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-#[path = "common/command.rs"]
-mod command;
-
 use std::{fs, path::Path, process::Command};
 
-use command::{EXPLAIN, SIMULATE, twin};
+use crate::command::{EXPLAIN, SIMULATE, twin};
 
 const PAIR: &str = "schema = 1\n[sensor]\n";
 

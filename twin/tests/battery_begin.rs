@@ -1,15 +1,7 @@
 //! What a battery remembers when its recording begins: a log that was cut out of a drive begins under load, and nobody recorded what
 //! flowed before.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-#[path = "common/cell.rs"]
-mod cell;
-#[path = "common/command.rs"]
-mod command;
-mod common;
-
-use cell::{AS_DESIGNED, Cell, NOISE_V, log, model, names, operation, said};
+use crate::cell::{AS_DESIGNED, Cell, NOISE_V, log, model, names, operation, said};
 use serde_json::Value;
 
 const SLOW: Cell = Cell {

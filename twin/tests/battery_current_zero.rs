@@ -1,14 +1,6 @@
 //! A cell whose recorded current has a zero: the battery's current is not what the recording says, and nothing of the cell is.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-#[path = "common/cell.rs"]
-mod cell;
-#[path = "common/command.rs"]
-mod command;
-mod common;
-
-use cell::{AS_DESIGNED, Cell, NOISE_V, log, model, names, operation, said};
+use crate::cell::{AS_DESIGNED, Cell, NOISE_V, log, model, names, operation, said};
 use serde_json::Value;
 
 /// What a model file says of the start and of the current.

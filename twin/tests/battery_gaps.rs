@@ -1,17 +1,10 @@
 //! A gap in a battery's recording: what flowed there is not known, is told by the voltages on both sides, and is no physics.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-#[path = "common/cell.rs"]
-mod cell;
-#[path = "common/command.rs"]
-mod command;
-mod common;
-
-use cell::{
+use crate::cell::{
     AS_DESIGNED, Cell, DESIGN_AH, DESIGN_OHM, NOISE_V, log, model, names, open_circuit_v,
     operation, said,
 };
+use crate::common;
 
 /// Gaps of some seconds, each from a time in s on.
 type Gaps<'a> = &'a [(u32, u32)];

@@ -1,14 +1,6 @@
 //! A cell whose ohmic resistance is not the stated one: aged, or behind a contact.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-#[path = "common/cell.rs"]
-mod cell;
-#[path = "common/command.rs"]
-mod command;
-mod common;
-
-use cell::{AS_DESIGNED, Cell, DESIGN_OHM, log, model, names, operation, said};
+use crate::cell::{AS_DESIGNED, Cell, DESIGN_OHM, log, model, names, operation, said};
 use serde_json::Value;
 
 /// What is said of a cell of so many times the stated resistance, which is uncertain by 5 %.

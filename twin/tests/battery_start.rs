@@ -1,18 +1,11 @@
 //! At which state of charge a battery begins: files that were never fitted, each operation of a log, and what is stated but not so.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-#[path = "common/cell.rs"]
-mod cell;
-#[path = "common/command.rs"]
-mod command;
-mod common;
-
+use crate::common;
 use std::fs;
 
-use cell::{AS_DESIGNED, Cell, NOISE_V, log, model, names, open_circuit_v, operation, said};
-use command::{SIMULATE, twin};
-use common::noise;
+use crate::cell::{AS_DESIGNED, Cell, NOISE_V, log, model, names, open_circuit_v, operation, said};
+use crate::command::{SIMULATE, twin};
+use crate::common::noise;
 
 /// Cells with an effect that the design lacks.
 fn concealed() -> [(&'static str, Cell); 2] {

@@ -1,17 +1,9 @@
 //! A cell whose resistances were found at one temperature, and what is predicted of it at another.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-#[path = "common/cell.rs"]
-mod cell;
-#[path = "common/command.rs"]
-mod command;
-mod common;
-
 use std::fs;
 
-use cell::{AS_DESIGNED, Cell, DESIGN_OHM, NOISE_V, log, model, names, operation, said};
-use command::{EXPLAIN, SIMULATE, twin};
+use crate::cell::{AS_DESIGNED, Cell, DESIGN_OHM, NOISE_V, log, model, names, operation, said};
+use crate::command::{EXPLAIN, SIMULATE, twin};
 use serde_json::Value;
 
 /// Arrhenius' law of a resistance from 25 °C on.

@@ -1,11 +1,7 @@
 //! What a reference does between its rows: loads that bend between them, made on a grid ten times finer than the rows by loops
 //! of this file. Straight lines between the rows make windows too short and a delay look like a window.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
-use common::{noise, said, sensor};
+use crate::common::{noise, said, sensor};
 use twin::report::data::{ParameterReport, Report, Verdict};
 
 const ROWS: usize = 3000;

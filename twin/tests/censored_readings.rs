@@ -2,11 +2,7 @@
 //! takes readings over an edge to either side, and each jumps by all of the threshold or the step. What is said of the next log of
 //! such a sensor.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
-use common::{noise, said, sensor};
+use crate::common::{noise, said, sensor};
 use twin::report::data::{Report, Verdict};
 
 const ROWS: usize = 3000;

@@ -1,10 +1,6 @@
 //! A battery's readings in steps: at rest they have one rounding error for hours, which counts once.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
-use common::{noise, prepared, said};
+use crate::common::{noise, prepared, said};
 use twin::report::data::{Report, Verdict};
 
 /// Seconds of drive, and of rest after it.

@@ -4,13 +4,9 @@
 //! their own on a finer grid of time than the recording's. So these tests are evidence of kind (d): our own simulator. They
 //! guard against regressions and prove nothing more.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
 use std::path::Path;
 
-use common::{noise, said, sensor};
+use crate::common::{noise, said, sensor};
 
 use twin::explain::{Holdout, Options, explain};
 use twin::problem::{Base, Coloured, Problem, SensorBase};

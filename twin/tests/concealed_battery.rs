@@ -4,13 +4,9 @@
 //! stands, solved by bisection, relaxation from branches, one by one. Evidence of kind (d): our own simulator; it guards against
 //! regressions and proves nothing more.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
 use std::path::Path;
 
-use common::{noise, said};
+use crate::common::{noise, said};
 
 use twin::problem::{Accuracy, Base, BatteryBase, Coloured, Drive, Observed, Problem, View};
 use twin::report::data::{Report, Verdict};

@@ -1,13 +1,8 @@
 //! `twin convert` as it is called.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-#[path = "common/command.rs"]
-mod command;
-
 use std::{fs, process::Command};
 
-use command::twin;
+use crate::command::twin;
 
 const DATABASE: &str = r#"VERSION ""
 

@@ -1,11 +1,7 @@
 //! Stretches in which a log is of something else: what the rest says is named, and the stretch is told with its place. What physics
 //! makes in one place only is no such stretch.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
-use common::{noise, said, sensor};
+use crate::common::{noise, said, sensor};
 use twin::problem::Problem;
 use twin::report::data::{LocationKind, Report, Verdict};
 

@@ -1,10 +1,6 @@
 //! What a recording is too short, or a model file too generous, to tell.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
-use common::{noise, prepared, said, sensor};
+use crate::common::{noise, prepared, said, sensor};
 use twin::report::data::Verdict;
 
 /// Two hours of a cell whose polarisation takes eleven: the search ends at three times the recording.

@@ -1,13 +1,9 @@
 //! `twin explain` and `twin effects` as they are called.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-#[path = "common/command.rs"]
-mod command;
-
+use crate::command;
 use std::{fs, path::Path, process::Output};
 
-use command::{EXPLAIN, twin};
+use crate::command::{EXPLAIN, twin};
 use rand_chacha::{
     ChaCha8Rng,
     rand_core::{Rng, SeedableRng},

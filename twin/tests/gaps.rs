@@ -1,9 +1,6 @@
 //! A gap in the recording is no new operation: what a cell or a core remembers goes on over it.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
+use crate::common;
 use std::ops::Range;
 
 use twin::effects::find_with;

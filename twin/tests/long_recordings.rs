@@ -1,12 +1,8 @@
 //! Recordings of more readings than fits look at.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
 use std::f64::consts::TAU;
 
-use common::{noise, said, sensor, steps};
+use crate::common::{noise, said, sensor, steps};
 use twin::report::data::Verdict;
 
 /// With every third reading the line would lie at 0.033 Hz.

@@ -1,7 +1,5 @@
 //! The model file: what it may hold, what is said of faults, and how effects are added.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
 use std::{fs, path::Path};
 
 use twin::{

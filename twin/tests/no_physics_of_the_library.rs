@@ -1,11 +1,7 @@
 //! What no effect of the library is gets no name, though one of them may take most of the mismatch. Where the design states no noise, what
 //! the readings change by from one to the next has to tell how much of it is left.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
-use common::{noise, prepared, said, sensor, steps};
+use crate::common::{noise, prepared, said, sensor, steps};
 use twin::report::data::{Report, Verdict};
 
 /// What is said of a state of charge in steps of half a per cent over 2000 s around a usual current that is off by so many

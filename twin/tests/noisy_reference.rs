@@ -1,11 +1,7 @@
 //! References with noise of their own: what is said of sensors that do not have it. The drive stands still for half of its time, as a
 //! drive in a town does, and there a reference shows nothing but its noise.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
-use common::{noise, said, sensor};
+use crate::common::{noise, said, sensor};
 use twin::align::{Signal, estimate};
 use twin::report::data::{Report, Verdict};
 

@@ -1,10 +1,6 @@
 //! An end of the range that one swing of the current reaches and no other: the rest of the drive says nothing of it.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
-use common::{noise, said, sensor};
+use crate::common::{noise, said, sensor};
 use twin::problem::Problem;
 use twin::report::data::{Report, Verdict};
 

@@ -1,7 +1,5 @@
 //! From recordings to problems: what is masked, cut and counted once, and nothing that is invented.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
 use std::{fs, path::Path};
 
 use twin::{

@@ -1,8 +1,6 @@
 //! What the tool says of real recordings, and what that is worth on files that were never fitted. docs/twin.md has the whole
 //! table, the misses too.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
 use std::{fs, path::Path, process::Command};
 
 use serde_json::Value;

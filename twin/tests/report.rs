@@ -1,9 +1,6 @@
 //! The report as data, as text and as the source of a page.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod report_sample;
-
+use crate::report_sample;
 use proptest::prelude::*;
 use serde_json::Value;
 use twin::report::{

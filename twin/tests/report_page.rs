@@ -1,9 +1,6 @@
 //! The report's page in a browser: what it draws, what it fetches, and whether it can be used.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod report_sample;
-
+use crate::report_sample;
 use std::{
     env,
     fs::{self, File},

@@ -1,22 +1,14 @@
 //! The board as designed against the firmware's own composition, and the simulation against the one that explains.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 // A drive of one segment is a list of one range.
 #![allow(clippy::single_range_in_vec_init)]
 
-#[path = "common/command.rs"]
-mod command;
-#[path = "../../core-logic/tests/support/host_board.rs"]
-mod host_board;
-#[path = "../../core-logic/tests/support/ideal_board.rs"]
-mod ideal_board;
-
 use std::{fs, path::Path};
 
-use command::{SIMULATE, twin};
+use crate::command::{SIMULATE, twin};
+use crate::host_board::{HostBoard, Step};
+use crate::ideal_board::{Event, Row, Timing};
 use core_logic::configuration::Configuration;
-use host_board::{HostBoard, Step};
-use ideal_board::{Event, Row, Timing};
 use twin::{
     effects::{
         Clues, LIBRARY,

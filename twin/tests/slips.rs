@@ -1,19 +1,12 @@
 //! Slips of a log: a few readings that are something else speak against no name, and are told.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-#[path = "common/cell.rs"]
-mod cell;
-#[path = "common/command.rs"]
-mod command;
-mod common;
-
+use crate::cell;
 use std::fmt::Write as _;
 use std::fs;
 
-use cell::{AS_DESIGNED, Cell, log, model, operation};
-use command::{EXPLAIN, twin};
-use common::noise;
+use crate::cell::{AS_DESIGNED, Cell, log, model, operation};
+use crate::command::{EXPLAIN, twin};
+use crate::common::noise;
 use serde_json::Value;
 
 /// What is said of readings that are one percent and 0.4 A too large, in a noise of 0.1 A, of which some slipped.

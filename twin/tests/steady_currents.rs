@@ -1,11 +1,7 @@
 //! Recordings in which the current hardly moves: a charging session, a staircase of a calibration. There one curve can stand for
 //! two effects so nearly that it alone is found, and no pair is looked for; what it leaves tells.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod common;
-
-use common::{noise, sensor};
+use crate::common::{noise, sensor};
 use twin::explain::{Options, explain};
 use twin::report::data::{Report, Verdict};
 

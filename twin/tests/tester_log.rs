@@ -1,16 +1,10 @@
 //! A cell on a tester, logged as testers do: rows only when something is due, a charge counter beside the current, a channel scanned
 //! after the other, and a table of open-circuit voltages of a few points. The cell is made here, second by second. Evidence of kind (d).
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-#[path = "common/command.rs"]
-mod command;
-mod common;
-
 use std::{fs, path::Path};
 
-use command::{EXPLAIN, twin};
-use common::noise;
+use crate::command::{EXPLAIN, twin};
+use crate::common::noise;
 use serde_json::Value;
 
 const CAPACITY_AH: f64 = 30.0;

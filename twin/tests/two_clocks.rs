@@ -1,7 +1,5 @@
 //! Offset and rate between two clocks: rates that cheap loggers have, rates that no clock has, and recordings that are not of one run.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
 use std::path::Path;
 
 use proptest::prelude::*;

@@ -1,8 +1,6 @@
 //! A cell that is made here, by loops on a grid ten times finer than the rows, and what is said of it. Evidence of kind (d): our own
 //! simulator; it guards against regressions and proves nothing more.
 
-#![allow(dead_code, reason = "not every test needs all of it")]
-
 use std::fs;
 
 use serde_json::Value;

@@ -6,7 +6,6 @@ use std::{
 };
 
 /// `twin explain` of `r.csv` under `m.toml`, into `out`.
-#[allow(dead_code, reason = "not every test explains")]
 pub const EXPLAIN: [&str; 7] = [
     "explain",
     "--model",
@@ -18,7 +17,6 @@ pub const EXPLAIN: [&str; 7] = [
 ];
 
 /// What simulates a recording under a model.
-#[allow(dead_code, reason = "not every test simulates")]
 pub const SIMULATE: [&str; 7] = [
     "simulate",
     "--model",

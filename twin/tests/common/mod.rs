@@ -23,7 +23,6 @@ pub fn noise(seed: u64, deviation: f64) -> impl FnMut() -> f64 {
 }
 
 /// A load in A that is drawn anew every so many rows of 0.1 s, and their times in s.
-#[allow(dead_code, reason = "not every test has a drive of steps")]
 pub fn steps(seed: u64, deviation_a: f64, rows: u32, every: u32) -> (Vec<f64>, Vec<f64>) {
     let mut load_a = noise(seed, deviation_a);
     let mut current_a = 0.0;
@@ -38,7 +37,6 @@ pub fn steps(seed: u64, deviation_a: f64, rows: u32, every: u32) -> (Vec<f64>, V
 }
 
 /// Readings of a sensor beside its current in A, at the same instants in s, under a design that states the noise alone.
-#[allow(dead_code, reason = "not every test has a sensor")]
 pub fn sensor(t_s: Vec<f64>, current_a: Vec<f64>, reading_a: Vec<f64>, noise_a: f64) -> Problem {
     Problem {
         view: View::Sensor,
@@ -61,7 +59,6 @@ pub fn sensor(t_s: Vec<f64>, current_a: Vec<f64>, reading_a: Vec<f64>, noise_a: 
 }
 
 /// A recording and its model file, both as text, prepared to be explained as `twin explain` does.
-#[allow(dead_code, reason = "not every test has files")]
 pub fn prepared(recording: &str, model: &str) -> Prepared {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("r.csv");
@@ -76,7 +73,6 @@ pub fn prepared(recording: &str, model: &str) -> Prepared {
 }
 
 /// What is said of a problem, with effects taken out of the library.
-#[allow(dead_code, reason = "not every test explains problems")]
 pub fn said(problem: Problem, seed: u64, without: &[&str]) -> Report {
     let options = Options {
         seed,
