@@ -27,6 +27,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::front_end::KeyFactors;
 use crate::range::Range;
+use crate::steadiness::{Limit, Steadiness};
 use crate::units::{
     Duration, Instant, Microamps, Microvolts, Nanocoulombs, abs_i64, clamp_i32, div_round, elapsed,
     mul_div, sub_i64,
@@ -70,7 +71,8 @@ pub struct KeyCalibrationConfig {
     pub settle_ms: u32,
     /// Longest delay of the permit after the key has left OFF.
     pub max_delay_ms: u32,
-    /// Largest spread, highest minus lowest, of the samples of one average.
+    /// Largest spread, highest minus lowest, of the samples of one average; of samples with noise ([`KeySample::noisy`]) of the means of
+    /// its quarters, and four times as much of single ones.
     pub max_spread: Microvolts,
     /// Largest magnitude of the meter's current at which the conductor counts as free of current. The meter hangs on
     /// the same sensor, so this must leave room for the offset that is to be found.
@@ -125,6 +127,8 @@ pub struct KeySample {
     pub range: Range,
     /// When it was converted. A sample with the time of the one before is the same sample and counts once.
     pub at: Instant,
+    /// It is of ADC1 (D3), whose noise alone spreads samples further than those of one average may.
+    pub noisy: bool,
 }
 
 /// What one step is fed with.
@@ -276,29 +280,17 @@ pub struct KeyCalibration {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Batch {
-    count: u16,
-    sum: i64,
-    lowest: i32,
-    highest: i32,
+    /// Of the outputs, in µV.
+    outputs: Steadiness,
     /// The meter's charge when it began.
     charge: Option<(Instant, Nanocoulombs)>,
 }
 
 impl Batch {
     const EMPTY: Self = Self {
-        count: 0,
-        sum: 0,
-        lowest: i32::MAX,
-        highest: i32::MIN,
+        outputs: Steadiness::EMPTY,
         charge: None,
     };
-
-    fn add(&mut self, voltage: Microvolts) {
-        self.count = self.count.saturating_add(1);
-        self.sum += i64::from(voltage.get());
-        self.lowest = self.lowest.min(voltage.get());
-        self.highest = self.highest.max(voltage.get());
-    }
 
     /// The mean current since it began: the meter's own mean may reach back to before.
     fn current(&self, now: Option<(Instant, Nanocoulombs)>) -> Option<Microamps> {
@@ -312,14 +304,6 @@ impl Batch {
                 time_us,
             )))
         })
-    }
-
-    fn spread(&self) -> Microvolts {
-        Microvolts(self.highest.saturating_sub(self.lowest))
-    }
-
-    fn mean(&self) -> Microvolts {
-        Microvolts(clamp_i32(div_round(self.sum, i64::from(self.count))))
     }
 }
 
@@ -515,25 +499,28 @@ impl KeyCalibration {
         if sample.range != Self::RANGE {
             return Err(KeyRefusal::WrongRange);
         }
-        if self.batch.count == 0 {
+        if self.batch.outputs.taken() == 0 {
             self.batch.charge = inputs.meter_charge;
         }
-        self.batch.add(voltage);
-        if self.batch.count < config.samples {
+        let limit = Limit {
+            spread: config.max_spread.get(),
+            samples: config.samples,
+            noisy: sample.noisy,
+        };
+        let taken = self.batch.outputs.take(limit, voltage.get());
+        if !taken.map_err(|spread| KeyRefusal::Unstable(Microvolts(spread)))? {
             return Ok(None);
         }
         let batch = core::mem::replace(&mut self.batch, Batch::EMPTY);
-        if batch.spread() > config.max_spread {
-            return Err(KeyRefusal::Unstable(batch.spread()));
-        }
+        let output = Microvolts(batch.outputs.mean());
         if let Some(current) = batch.current(inputs.meter_charge)
             && current.saturating_abs() > config.max_current
         {
             return Err(KeyRefusal::CurrentFlows(current));
         }
         if self.phase == KeyPhase::Off {
-            first_factor(config, sample.zero, batch.mean())?;
-            self.off_output = Some(batch.mean());
+            first_factor(config, sample.zero, output)?;
+            self.off_output = Some(output);
             self.off_zero = sample.zero;
             self.refusal = None;
             return Ok(None);
@@ -545,7 +532,7 @@ impl KeyCalibration {
             i64::from(KeyFactors::K_ONE_PPB),
             i64::from(k_ppb),
         )));
-        let a = zero_output.saturating_sub(batch.mean());
+        let a = zero_output.saturating_sub(output);
         if a.saturating_abs() > config.max_a {
             return Err(KeyRefusal::AOutOfLimits(a));
         }
@@ -621,6 +608,7 @@ mod tests {
         range: Range,
         /// Added to every other sample.
         ripple: i32,
+        noisy: bool,
         samples: u64,
         /// By the meter's charge; its mean is what `inputs` says.
         milliamps: i64,
@@ -646,6 +634,7 @@ mod tests {
                 zero: SENSOR_ZERO,
                 range: Range::Small,
                 ripple: 0,
+                noisy: false,
                 samples: 0,
                 milliamps: 0,
             }
@@ -680,6 +669,7 @@ mod tests {
                     zero: self.zero,
                     range: self.range,
                     at: self.inputs.now,
+                    noisy: self.noisy,
                 });
                 outputs = self.step();
                 factors = factors.or(outputs.new_factors);
@@ -874,6 +864,26 @@ mod tests {
         assert_eq!(outputs.phase, KeyPhase::Taken);
     }
 
+    /// Of D3's samples the means of quarters have to lie within the limit, single ones within four times it.
+    #[test]
+    fn noisy_samples_are_judged_by_the_means_of_quarters() {
+        let config = KeyCalibrationConfig {
+            samples: 8,
+            ..config()
+        };
+        let with = |noisy, ripple| {
+            let mut car = after_off(config);
+            (car.noisy, car.ripple) = (noisy, ripple);
+            let (outputs, factors) = car.run_ms(800);
+            factors.map(|factors| factors.a).ok_or(outputs.refusal)
+        };
+        let unstable = |spread| Err(Some(KeyRefusal::Unstable(Microvolts(spread))));
+        assert_eq!(with(false, 2_001), unstable(2_001));
+        // Half of the ripple is in the mean.
+        assert_eq!(with(true, 8_000), Ok(Microvolts(10_000 - 4_000)));
+        assert_eq!(with(true, 8_001), unstable(8_001));
+    }
+
     #[test]
     fn each_condition_against_it_is_the_reason() {
         type Change = fn(&mut Car);
@@ -977,11 +987,11 @@ mod tests {
         let mut car = after_off(config());
         // Samples 4, 5, 6 count.
         car.run_ms(6 * 31 + 4);
-        assert_eq!(car.calibration.batch.count, 3);
+        assert_eq!(car.calibration.batch.outputs.taken(), 3);
         car.voltage = None;
         let outputs = car.run_ms(31 + 1).0;
         assert_eq!(
-            (outputs.refusal, car.calibration.batch.count),
+            (outputs.refusal, car.calibration.batch.outputs.taken()),
             (Some(KeyRefusal::InvalidSample), 0)
         );
     }
@@ -1047,6 +1057,7 @@ mod tests {
                 zero: SENSOR_ZERO,
                 range: Range::Small,
                 at: Instant::from_ticks(1_000_000 + us),
+                noisy: false,
             })
         };
         car.step();
@@ -1061,23 +1072,23 @@ mod tests {
         car.config.samples = 3;
         car.step();
         car.step();
-        assert_eq!(car.calibration.batch.count, 0);
+        assert_eq!(car.calibration.batch.outputs.taken(), 0);
         car.inputs.sample = sample(131_250);
         car.step();
         car.step();
-        assert_eq!(car.calibration.batch.count, 1);
+        assert_eq!(car.calibration.batch.outputs.taken(), 1);
         // A change of the high voltage begins anew, also without a settling time.
         car.config.settle_ms = 0;
         car.inputs.can_high_voltage = Some(true);
         car.step();
-        assert_eq!(car.calibration.batch.count, 0);
+        assert_eq!(car.calibration.batch.outputs.taken(), 0);
         car.inputs.can_high_voltage = Some(false);
         car.inputs.sample = sample(199_999);
         car.step();
-        assert_eq!(car.calibration.batch.count, 0);
+        assert_eq!(car.calibration.batch.outputs.taken(), 0);
         car.inputs.sample = sample(200_000);
         car.step();
-        assert_eq!(car.calibration.batch.count, 1);
+        assert_eq!(car.calibration.batch.outputs.taken(), 1);
     }
 
     #[test]
@@ -1243,6 +1254,7 @@ mod tests {
                     [None, Some(KeyState::Off), Some(KeyState::Acc), Some(KeyState::On), Some(KeyState::Start)][usize::from(can)];
                 car.inputs.sample = Some(KeySample {
                     voltage: Some(Microvolts(voltage)), zero: SENSOR_ZERO, range: Range::Small, at: car.inputs.now,
+                    noisy: false,
                 });
                 let outputs = car.step();
                 if outputs.key == KeyState::Off {
@@ -1300,6 +1312,7 @@ mod tests {
                         zero: Microvolts(wild.1.wrapping_add(wild.3.cast_signed())),
                         range: if flags[3] { Range::Small } else { Range::Large },
                         at: Instant::from_ticks(at),
+                        noisy: flags[0],
                     }),
                 });
                 if outputs.key == KeyState::Off {

@@ -32,6 +32,7 @@ pub mod range;
 pub mod retained;
 pub mod sliding_average;
 pub mod soc;
+mod steadiness;
 pub mod storm;
 pub mod supply_calibration;
 pub mod units;

@@ -903,6 +903,7 @@ impl Measurement {
                     zero,
                     range: self.reading.range,
                     at: self.reading.at,
+                    noisy: self.readings_are_noisy(),
                 }),
             },
         );
@@ -1329,8 +1330,13 @@ impl Measurement {
         ZeroConditions {
             high_voltage_is_off: self.is_at_rest(),
             meter_mean: self.meter_mean(),
-            noisy: self.prepared.converter.channel() == Channel::Adc1,
+            noisy: self.readings_are_noisy(),
         }
+    }
+
+    /// Whether ADC1 converts the current (D3).
+    fn readings_are_noisy(&self) -> bool {
+        self.prepared.converter.channel() == Channel::Adc1
     }
 
     /// Not received in time, or received as not available.

@@ -9,18 +9,11 @@ use crate::converter::CurrentReading;
 use crate::design_parameters as design;
 use crate::front_end::PerRange;
 use crate::range::Range;
-use crate::units::{Duration, Instant, Microamps, add_i64, clamp_i32, div_round, elapsed};
+use crate::steadiness::{Limit, Steadiness};
+use crate::units::{Duration, Instant, Microamps, elapsed};
 
 /// Readings of a calibration that [`ZeroDriftConfig::is_valid`] accepts.
 pub const SAMPLE_LIMITS: (u16, u16) = (4, 1_024);
-
-/// Parts of a run of noisy readings whose means are compared. If no current flowed in one of the four, the zero is off by three quarters of the
-/// spread at most, as it is by the whole spread if none flowed in one reading of those that have no noise. More parts would be too short to be
-/// free of noise: at D3's 0.25 A (rms; 0.11 A of it are the reference's, alike in neighbours) the means of 64 readings' quarters lie further apart
-/// than 0.5 A in 0.4 % of all runs, those of its eighths in 5 %.
-const NOISY_PARTS: u16 = 4;
-/// The mean of a quarter of 64 readings has a quarter of a reading's noise. Of D3's, 64 lie further apart than 2 A once in thousands of runs.
-const NOISY_SPREADS: i32 = 4;
 
 /// Configuration of the zero drift.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -33,7 +26,7 @@ pub struct ZeroDriftConfig {
     /// Valid readings that a calibration takes.
     pub samples: u16,
     /// Largest distance between the lowest and the highest of them; of readings with noise ([`ZeroConditions::noisy`]) between the means
-    /// of the run's quarters, and `NOISY_SPREADS` times as much between single ones.
+    /// of the run's quarters, and four times as much between single ones.
     pub max_spread: PerRange<Microamps>,
     /// Largest mean current of the energy meter, both signs, at which there may be no current flowing. The meter's own
     /// zero error is in it.
@@ -175,34 +168,7 @@ struct Run {
     in_use: Microamps,
     started: Instant,
     last_at: Option<Instant>,
-    taken: u16,
-    sum: i64,
-    readings: Extent,
-    means: Extent,
-    /// Of the parts that are complete.
-    parts_sum: i64,
-}
-
-/// From the lowest to the highest.
-#[derive(Clone, Copy, Debug)]
-struct Extent {
-    low: Microamps,
-    high: Microamps,
-}
-
-impl Extent {
-    const EMPTY: Self = Self {
-        low: Microamps(i32::MAX),
-        high: Microamps(i32::MIN),
-    };
-
-    /// Takes `value` in, and says how far apart the ends are then. Once in the image: it is asked twice a reading, and flash is short.
-    #[inline(never)]
-    fn widened(&mut self, value: Microamps) -> Microamps {
-        self.low = self.low.min(value);
-        self.high = self.high.max(value);
-        self.high.saturating_sub(self.low)
-    }
+    readings: Steadiness,
 }
 
 /// State of "zero now".
@@ -229,7 +195,7 @@ impl ZeroCalibration {
     pub fn progress(&self, config: &ZeroDriftConfig) -> Option<ZeroProgress> {
         self.run.map(|run| ZeroProgress {
             range: run.range,
-            taken: run.taken,
+            taken: run.readings.taken(),
             of: config.samples,
         })
     }
@@ -254,11 +220,7 @@ impl ZeroCalibration {
             in_use: config.value.get(range),
             started: now,
             last_at: None,
-            taken: 0,
-            sum: 0,
-            readings: Extent::EMPTY,
-            means: Extent::EMPTY,
-            parts_sum: 0,
+            readings: Steadiness::EMPTY,
         });
         Ok(())
     }
@@ -333,38 +295,26 @@ fn take(
         return Some(Err(ZeroRefusal::InvalidReading));
     }
     run.last_at = Some(reading.at);
-    run.taken = run.taken.saturating_add(1);
-    run.sum += i64::from(reading.current.get());
-    let max_spread = config.max_spread.get(run.range);
-    let (part, spreads) = if conditions.noisy {
-        ((config.samples / NOISY_PARTS).max(1), NOISY_SPREADS)
-    } else {
-        (1, 1)
+    let limit = Limit {
+        spread: config.max_spread.get(run.range).get(),
+        samples: config.samples,
+        noisy: conditions.noisy,
     };
-    let spread = run.readings.widened(reading.current);
-    if spread.get() > max_spread.get().saturating_mul(spreads) {
-        return Some(Err(ZeroRefusal::Unstable { spread }));
+    match run.readings.take(limit, reading.current.get()) {
+        Ok(true) => {}
+        Ok(false) => return None,
+        Err(spread) => {
+            let spread = Microamps(spread);
+            return Some(Err(ZeroRefusal::Unstable { spread }));
+        }
     }
-    if !run.taken.is_multiple_of(part) {
-        return None;
-    }
-    let of_part = run.sum - core::mem::replace(&mut run.parts_sum, run.sum);
-    let mean = div_round(of_part, i64::from(part));
-    let of_means = run.means.widened(Microamps(clamp_i32(mean)));
-    if of_means > max_spread {
-        return Some(Err(ZeroRefusal::Unstable { spread: of_means }));
-    }
-    if run.taken < config.samples {
-        return None;
-    }
-    let mean = div_round(run.sum, i64::from(run.taken));
-    let value = Microamps(clamp_i32(add_i64(i64::from(run.in_use.get()), mean)));
+    let value = (run.in_use).saturating_add(Microamps(run.readings.mean()));
     let result = config
         .check_value(run.range, value)
         .map(|value| ZeroResult {
             range: run.range,
             value,
-            spread,
+            spread: Microamps(run.readings.spread()),
         });
     Some(result)
 }

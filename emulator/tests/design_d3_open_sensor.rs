@@ -12,6 +12,9 @@ use plant::front_end::{Faults, FrontEndConfig, SensorFault};
 use plant::network::NetworkConfig;
 use support::{Bench, Ended, firmware};
 
+/// The state of the key-state calibration on CAN.
+const TAKEN: f64 = 2.0;
+
 fn at_rest() -> Row {
     Row {
         cell_v: Some(3.7),
@@ -153,6 +156,17 @@ fn open_sensor_is_found_within_two_readings_and_no_legal_level_is_taken_for_one(
     assert!((amps - 100.0).abs() < 1.0, "{amps} A");
 }
 
+/// Readings of so many seconds, in A.
+fn readings_a(bench: &mut Bench<'_>, seconds: f64) -> Vec<f64> {
+    bench.record();
+    bench.run(seconds);
+    let frames = bench.conversions();
+    frames
+        .iter()
+        .map(|frame| frame.current_a.unwrap())
+        .collect()
+}
+
 /// ADC1 with a code of noise, rms: 0.45 A of each conversion of the network and 0.61 A of each of the reference.
 #[test]
 fn a_noisy_converter_is_averaged_and_still_calibrated() {
@@ -166,13 +180,7 @@ fn a_noisy_converter_is_averaged_and_still_calibrated() {
     bench.set("stability window", &[10]);
     bench.set("rest time", &[60]);
 
-    bench.record();
-    bench.run(10.0);
-    let readings: Vec<f64> = bench
-        .conversions()
-        .iter()
-        .map(|frame| frame.current_a.unwrap())
-        .collect();
+    let readings = readings_a(&mut bench, 10.0);
     let count = readings.len() as f64;
     let mean = readings.iter().sum::<f64>() / count;
     let deviation_a =
@@ -185,6 +193,42 @@ fn a_noisy_converter_is_averaged_and_still_calibrated() {
     // A reading of more than the 1 A of `rest current` would have ended the rest: at 100 readings a second there are 6,000.
     bench.run(65.0);
     assert_eq!(bench.input("anchorings"), 1);
+}
+
+/// D4's factors of D3's sensor: with key OFF and with key ACC 16 readings are averaged, which ADC1's noise spreads.
+#[test]
+fn key_factors_are_taken_through_the_noise() {
+    const CYCLES: usize = 10;
+    const NOISE_CODES: f64 = 1.5;
+    let firmware = firmware();
+    let mut bench = network_board(&firmware, NetworkConfig::default());
+    bench.vehicle(at_rest().with_key(Key::Off));
+    bench.run(2.0);
+    bench.set("key calibration: enabled", &[1]);
+    bench
+        .rig
+        .machine
+        .adc(|adc| adc.set_noise_codes(NOISE_CODES));
+    let mut taken = 0;
+    let mut zeros_a = Vec::new();
+    for _ in 0..CYCLES {
+        bench.vehicle(at_rest().with_key(Key::Off));
+        bench.run(1.0);
+        bench.vehicle(at_rest().with_key(Key::Accessory));
+        // Beyond the longest delay of the permit.
+        bench.run(1.6);
+        taken += usize::from(bench.signal("BoardState", "KeyCalibration") == TAKEN);
+        let readings = readings_a(&mut bench, 1.0);
+        zeros_a.push(readings.iter().sum::<f64>() / readings.len() as f64);
+    }
+    let largest_a = zeros_a.iter().fold(0.0f64, |most, a| most.max(a.abs()));
+    println!(
+        "D3: {NOISE_CODES} codes of noise: {taken} of {CYCLES} taken, 0 A is off by up to {largest_a:.2} A"
+    );
+    assert_eq!(taken, CYCLES);
+    // Of a reading's 0.26 A with a code of noise 0.11 A are the reference's, alike in neighbours; four standard deviations.
+    let of_16_a = NOISE_CODES * (0.235f64.powi(2) / 16.0 + 0.11f64.powi(2)).sqrt();
+    assert!(largest_a <= 4.0 * of_16_a, "{zeros_a:?}");
 }
 
 #[test]

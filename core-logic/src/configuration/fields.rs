@@ -401,7 +401,7 @@ fields! {
     0x0404 U16 1 Standstill (1, 1_024) "key calibration: samples" "" "that are averaged" [at key_calibration.samples];
     0x0406 U32 1 Standstill (0, 10_000) "key calibration: settling" "ms" "after a change of key or high voltage" [at key_calibration.settle_ms];
     0x0408 U32 1 Standstill (100, 60_000) "key calibration: longest delay" "ms" "of the high-voltage permit" [at key_calibration.max_delay_ms];
-    0x040A I32 1 Standstill (1, 100_000) "key calibration: spread" "µV" "largest, of one average" [at key_calibration.max_spread];
+    0x040A I32 1 Standstill (1, 100_000) "key calibration: spread" "µV" "largest, of one average; with the network (D3), whose noise is larger, between the means of its quarters, and four times as much between samples" [at key_calibration.max_spread];
     0x040C I32 1 Standstill (1, 50_000_000) "key calibration: current" "µA" "largest magnitude by the meter that counts as none" [at key_calibration.max_current];
     0x040E I32 1 Standstill (1, 100_000) "key calibration: k" "ppm" "largest magnitude of k − 1" [at key_calibration.max_k_deviation_ppm];
     0x0410 I32 1 Standstill (1, 500_000) "key calibration: a" "µV" "largest magnitude of a" [at key_calibration.max_a];
