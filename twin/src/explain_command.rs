@@ -529,6 +529,7 @@ fn extended(model: &Model, report: &Report, file: &Path, out: &Path) -> Result<S
         }
         shift.take(&fitted.nuisance, fitted.of_battery);
         shift.smooth_reference |= fitted.smooth_reference;
+        shift.held_reference = shift.held_reference.or(fitted.held_reference);
         shift.current_holds = shift.current_holds.or(fitted.current_holds);
     }
     model.extended(&found, shift, file.parent().unwrap_or(Path::new("")), out)

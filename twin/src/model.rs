@@ -8,12 +8,15 @@ pub mod registry;
 
 use std::{
     collections::BTreeMap,
-    fs,
+    fmt, fs,
     path::{Path, PathBuf},
 };
 
 use recording::{csv, error::number, name};
-use serde::{Deserialize, Deserializer, de::IntoDeserializer};
+use serde::{
+    Deserialize, Deserializer,
+    de::{self, IntoDeserializer, Visitor},
+};
 
 pub use extended::{Found, Shift};
 use place::Places;
@@ -44,6 +47,30 @@ pub enum FrontEndKind {
     Network,
     /// The board with a closed-loop sensor (D4).
     ClosedLoop,
+}
+
+/// `true` for [`Holds::UntilNextRow`], `false` for none, or the word.
+fn held<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Holds>, D::Error> {
+    struct Held;
+    impl Visitor<'_> for Held {
+        type Value = Option<Holds>;
+
+        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            let [since, until] = Holds::ALL.map(Holds::as_str);
+            write!(f, "true, false, \"{since}\" or \"{until}\"")
+        }
+
+        fn visit_bool<E>(self, held: bool) -> Result<Self::Value, E> {
+            Ok(held.then_some(Holds::UntilNextRow))
+        }
+
+        fn visit_str<E: de::Error>(self, word: &str) -> Result<Self::Value, E> {
+            let holds = Holds::ALL.into_iter().find(|holds| holds.as_str() == word);
+            let unknown = || E::invalid_value(de::Unexpected::Str(word), &self);
+            holds.map(Some).ok_or_else(unknown)
+        }
+    }
+    deserializer.deserialize_any(Held)
 }
 
 /// A word of a fixed list. What is no text is named as what it is; of an enumeration alone serde asks for a "string or table".
@@ -102,8 +129,9 @@ pub struct Sensor {
     pub range_limit: Option<f64>,
     /// Accuracy of the reference instrument.
     pub accuracy: AccuracySpec,
-    /// The reference stays at its value until its next row.
-    pub held_reference: bool,
+    /// The reference stays at one value between its rows, and which.
+    #[serde(deserialize_with = "held")]
+    pub held_reference: Option<Holds>,
     /// The reference goes from row to row in a smooth course.
     pub smooth_reference: bool,
     /// Time means nothing: the order of the rows counts, not when they were measured.
@@ -114,6 +142,13 @@ pub struct Sensor {
     pub jitter_s: f64,
     /// Time by which readings stand for an earlier moment than their row, in s; `twin explain` finds it with an effect.
     pub alignment_s: f64,
+}
+
+impl Sensor {
+    /// Whether the reference stays at its value until its next row.
+    pub fn is_held(&self) -> bool {
+        self.held_reference == Some(Holds::UntilNextRow)
+    }
 }
 
 /// `[charge]`: the sensor's charge counter.
@@ -471,7 +506,7 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
         sensor.noise_coloured_tau_s,
     )?;
     check_accuracy(places, ["sensor", "accuracy"], &sensor.accuracy)?;
-    if sensor.smooth_reference && sensor.held_reference {
+    if sensor.smooth_reference && sensor.held_reference.is_some() {
         let expected = "one of smooth_reference and held_reference";
         return Err(places.fault(&["sensor", "smooth_reference"], "both", expected));
     }
@@ -512,6 +547,11 @@ fn check_sensor(sensor: &Sensor, places: &Places<'_>) -> Result<(), Failure> {
             "smooth_reference",
             sensor.smooth_reference,
             "conversions of straight lines",
+        ),
+        (
+            "held_reference",
+            sensor.held_reference == Some(Holds::SinceLastRow),
+            "what is held until the next row (true)",
         ),
     ] {
         if stated {

@@ -31,7 +31,9 @@ use crate::{
     explain,
     failure::Failure,
     model::{Model, Sensor, registry},
-    problem::{Accuracy, Base, Coloured, Drive, Observed, Problem, SensorBase, Series, View},
+    problem::{
+        Accuracy, Base, Coloured, Drive, Holds, Observed, Problem, SensorBase, Series, View,
+    },
     report::format::count,
     simulate::board::{Board, Pace},
 };
@@ -486,9 +488,12 @@ impl<'a> Work<'a> {
                 &counter,
             )?);
         }
-        if sensor.smooth_reference {
-            for item in &mut items {
+        for item in &mut items {
+            if sensor.smooth_reference {
                 item.problem = item.problem.with_smooth_reference();
+            }
+            if let Some(holds @ Holds::SinceLastRow) = sensor.held_reference {
+                item.problem = item.problem.with_held_reference(holds);
             }
         }
         Ok(items)
@@ -512,7 +517,7 @@ impl<'a> Work<'a> {
             step: sensor.step,
             full_scale: sensor.full_scale,
             range_limit: sensor.range_limit,
-            held_reference: sensor.held_reference,
+            held_reference: sensor.is_held(),
             quasi_static: sensor.quasi_static,
             alignment_s: sensor.alignment_s,
             ..SensorBase::default()
@@ -530,7 +535,7 @@ impl<'a> Work<'a> {
             let run = |age_s: f64| {
                 let mut earlier = observed.clone();
                 earlier.t_s.iter_mut().for_each(|t| *t -= age_s);
-                board.run(&drive, sensor.held_reference, &earlier, pace, false)
+                board.run(&drive, sensor.is_held(), &earlier, pace, false)
             };
             let (_, reported) = phase::closest(sensor.age_s, (slack_s, PHASES), &observed, run);
             self.compare_range_flag(board, &mut drive, &observed, &reported.range_high);

@@ -96,7 +96,8 @@ pub struct Drive {
     /// Where the mean over the step that ends at each row lies, from the value where it begins (0) to the one where it ends (1), as a
     /// counter beside the current tells ([`ends`]); `None`: half-way, the reference goes in straight lines.
     pub mean_share: Option<Series>,
-    /// The reference stays at one value between its rows, and [`Self::mean_share`] says so.
+    /// The reference stays at one value between its rows, which [`Self::mean_share`] says of a battery's, and the rows themselves with
+    /// [`SensorBase::held_reference`] of a sensor's.
     pub holds: Option<Holds>,
     /// Stretches with one clock and no gap; filters start anew in each.
     pub segments: Vec<Range<usize>>,

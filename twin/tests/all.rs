@@ -30,6 +30,7 @@ mod dropouts;
 mod end_of_search;
 mod explain_command;
 mod gaps;
+mod held_reference;
 mod long_recordings;
 mod model;
 mod no_physics_of_the_library;

@@ -1,4 +1,4 @@
-//! A reference between its rows: in straight lines, smoothly, or, the current of a battery, at one value.
+//! A reference between its rows: in straight lines, smoothly, or at one value.
 
 use std::borrow::Cow;
 
@@ -14,6 +14,9 @@ use crate::report::data::Verdict;
 /// The reference goes smoothly from row to row, or stays, if that makes the loss smaller by this (odds of e¹⁰, for no value more); where its
 /// rows alone tell so, unless it makes it larger by this.
 const CLEARLY: f64 = 10.0;
+/// A sensor's reference may be held if the nearest single time leaves less than this share of the squared error that it leaves with
+/// straight lines: an edge that is off by half a row is most of what is left beside edges.
+const MOSTLY: f64 = 0.5;
 
 /// What a battery remembers of before the recording has faded within this share of the recording's time, to …
 const FADES_WITHIN: f64 = 0.25;
@@ -187,6 +190,25 @@ impl Course<'_> {
         Some((self.with(problem, Problem::with_smooth_reference), told))
     }
 
+    /// The one whose reference stays at one value between its rows, of both the one that the readings are nearer to, if they are much
+    /// nearer to it than to straight lines.
+    fn held(&self, options: &Options) -> Option<Course<'static>> {
+        if !self.problem.may_be_held() {
+            return None;
+        }
+        let squares = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
+        let straight = squares(&self.nearest(options)?);
+        let held = Holds::ALL.into_iter().filter_map(|holds| {
+            let course = self.with(self.problem.with_held_reference(holds), |other| {
+                other.with_held_reference(holds)
+            });
+            let left = squares(&course.nearest(options)?);
+            Some((course, left))
+        });
+        let (course, left) = held.min_by(|one, other| one.1.total_cmp(&other.1))?;
+        (left < MOSTLY * straight).then_some(course)
+    }
+
     /// Another form of the problem, and the same of the files that were never fitted.
     fn with(&self, problem: Problem, form: impl Fn(&Problem) -> Problem) -> Course<'static> {
         let holdout = |holdout: &Holdout| Holdout {
@@ -240,12 +262,29 @@ impl Course<'_> {
         fits.min_by(|one, other| gained(one, other).total_cmp(&0.0))
     }
 
-    /// Decided in straight lines or as a smooth course, whichever may be better, or both ways.
+    /// Decided in straight lines or as a smooth course, whichever may be better, or both ways; where that leaves something, with a reference
+    /// that is held too.
     pub(super) fn answered(
         &self,
         options: &Options,
         progress: &mut dyn FnMut(f64, &str),
     ) -> Answer {
+        let answer = self.answered_bent(options, progress);
+        let decided = &answer.decided;
+        let is_open = decided.asks_between() && decided.leaves_something();
+        let Some(held) = is_open.then(|| self.held(options)).flatten() else {
+            return answer;
+        };
+        let (again, there) = held.decided(options, progress);
+        // A load that is switched may be nearer to edges at the rows and have them at other moments: then something is left again.
+        if again.says_more_than(decided) && gained(&answer.shown, &there) > CLEARLY {
+            return Answer::on(held, (again, there), &answer.shown);
+        }
+        answer
+    }
+
+    /// The same of what is not held.
+    fn answered_bent(&self, options: &Options, progress: &mut dyn FnMut(f64, &str)) -> Answer {
         let Some((smooth, told)) = self.smooth() else {
             return self.answered_of_battery(options, progress);
         };

@@ -9,7 +9,7 @@ use super::workbench::{Member, Workbench};
 use super::{Nuisance, locate, rms};
 use crate::effects::ocv::bend_v;
 use crate::effects::{CurrentError, find};
-use crate::problem::{Base, Problem, View};
+use crate::problem::{Base, Holds, Problem, View};
 use crate::report::data::{
     EffectReport, FittedModel, Known, Location, LocationKind, ParameterReport, Report, SignalPlots,
     Verdict,
@@ -574,11 +574,19 @@ pub(super) fn times_found(
 /// How the reference of a problem goes where its rows do not say, and what it would do otherwise.
 fn goes(problem: &Problem, nuisance: &Nuisance) -> Option<(String, &'static str)> {
     const STRAIGHT: &str = "with straight lines";
-    if matches!(problem.base, Base::Sensor(_)) {
-        let smooth = "between its rows the reference is taken to go smoothly";
-        return Some((smooth.to_owned(), STRAIGHT));
-    }
     let holds = problem.drive.holds;
+    if matches!(problem.base, Base::Sensor(_)) {
+        let goes = match holds {
+            None => "between its rows the reference is taken to go smoothly",
+            Some(Holds::SinceLastRow) => {
+                "each row's reference is taken to have stood there since the row before"
+            }
+            Some(Holds::UntilNextRow) => {
+                "each row's reference is taken to stay there until the next row"
+            }
+        };
+        return Some((goes.to_owned(), STRAIGHT));
+    }
     let instead = if holds.is_some() {
         STRAIGHT
     } else {
@@ -676,6 +684,7 @@ pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
             .map(|parameter| parameter.name.to_owned());
         names.zip(member.values.iter().copied()).collect()
     };
+    let of_battery = matches!(problem.base, Base::Battery(_));
     FittedModel {
         signal: problem.name.clone(),
         effects: fit
@@ -685,9 +694,10 @@ pub(super) fn fitted(problem: &Problem, fit: &Fit) -> FittedModel {
             .map(|member| (member.id().to_owned(), values(member)))
             .collect(),
         nuisance,
-        of_battery: matches!(problem.base, Base::Battery(_)),
+        of_battery,
         smooth_reference: matches!(&problem.base, Base::Sensor(base) if base.smooth_reference),
-        current_holds: problem.drive.holds,
+        held_reference: problem.drive.holds.filter(|_| !of_battery),
+        current_holds: problem.drive.holds.filter(|_| of_battery),
     }
 }
 

@@ -44,6 +44,8 @@ pub struct Shift {
     pub voltage_alignment_s: f64,
     /// The reference goes from row to row in a smooth course.
     pub smooth_reference: bool,
+    /// The reference stays at one value between its rows.
+    pub held_reference: Option<Holds>,
     /// A battery's current stays at one value between its rows.
     pub current_holds: Option<Holds>,
 }
@@ -104,6 +106,11 @@ impl Extension<'_> {
             && let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut)
         {
             set(sensor, "smooth_reference", value(true));
+        }
+        if let Some(holds) = self.shift.held_reference
+            && let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut)
+        {
+            set(sensor, "held_reference", value(holds.as_str()));
         }
         if !self.effects.is_empty() {
             self.effects(&mut document)?;

@@ -70,7 +70,7 @@ pub(super) fn item(
     let mut step_c = board.map_or(spec.step_c, Board::charge_step_c);
     if step_c <= 0.0
         && work.purpose.compares()
-        && let Some(found_c) = shown_step_c(drive, &readings, sensor.held_reference)
+        && let Some(found_c) = shown_step_c(drive, &readings, sensor.is_held())
     {
         step_c = found_c;
         work.remark(format!(
@@ -109,7 +109,7 @@ pub(super) fn item(
         step: step_c / spacing_s,
         full_scale: sensor.full_scale,
         range_limit: sensor.range_limit,
-        held_reference: sensor.held_reference,
+        held_reference: sensor.is_held(),
         alignment_s: sensor.alignment_s,
         quasi_static: sensor.quasi_static,
         ..SensorBase::default()
@@ -122,14 +122,14 @@ pub(super) fn item(
         let run = |later_s: f64| {
             let mut earlier = observed.clone();
             earlier.t_s.iter_mut().for_each(|t| *t -= later_s);
-            let mut reported = board.run(&drive, sensor.held_reference, &earlier, Pace::Seen, true);
+            let mut reported = board.run(&drive, sensor.is_held(), &earlier, Pace::Seen, true);
             reported.current_a = means(&earlier, &reported.charge_c);
             reported
         };
         let slack_s = if spec.age_s > 0.0 { TICK_S } else { 0.0 };
         let (tick_s, reported) = phase::closest(0.0, (slack_s, 1), &observed, run);
         // The jitter is a moment that nothing tells, and much the same all over a recording.
-        let rate = rates(&drive, &observed, tick_s, sensor.held_reference);
+        let rate = rates(&drive, &observed, tick_s, sensor.is_held());
         let most_s = 0.5 * spec.jitter_s;
         let later_s = tick_s + phase::later_s(&observed, &reported, &rate).clamp(-most_s, most_s);
         let reported = run(later_s);
@@ -137,7 +137,7 @@ pub(super) fn item(
         base.reading = reported.current_a;
         if drive.range_high.is_none() && board.has_two_ranges() {
             let every = series::every_row(&drive);
-            let flag = board.run(&drive, sensor.held_reference, &every, Pace::Free, false);
+            let flag = board.run(&drive, sensor.is_held(), &every, Pace::Free, false);
             drive.range_high = Some(flag.range_high.into());
         }
     }

@@ -71,7 +71,9 @@ pub struct FittedModel {
     pub of_battery: bool,
     /// Whether the reference was found to go from row to row in a smooth course.
     pub smooth_reference: bool,
-    /// Whether a battery's current was found to stay at one value from row to row, and which.
+    /// Whether a sensor's reference was found to stay at one value from row to row, and which.
+    pub held_reference: Option<crate::problem::Holds>,
+    /// The same of a battery's current.
     pub current_holds: Option<crate::problem::Holds>,
 }
 
