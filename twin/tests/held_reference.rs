@@ -15,7 +15,7 @@ const ROW_S: f64 = 0.1;
 
 /// A log of a low-pass with a gain behind a current that is at a row's value until a share of the step to the next one has gone.
 fn log(until: impl Fn(usize) -> f64) -> String {
-    let (current_a, t_s) = steps(5, 80.0, 3000, 20);
+    let (t_s, current_a) = steps(5, 80.0, 3000, 20);
     let mut noise_a = noise(6, NOISE_A);
     let mut text = "t_s,i_ref_a,i_meas_a\n".to_owned();
     let mut low_passed_a = current_a[0];
