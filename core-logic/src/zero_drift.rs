@@ -308,7 +308,7 @@ fn take(
             return Some(Err(ZeroRefusal::Unstable { spread }));
         }
     }
-    let value = (run.in_use).saturating_add(Microamps(run.readings.mean()));
+    let value = run.in_use.saturating_add(Microamps(run.readings.mean()));
     let result = config
         .check_value(run.range, value)
         .map(|value| ZeroResult {

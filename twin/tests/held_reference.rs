@@ -31,7 +31,7 @@ fn log(until: impl Fn(usize) -> f64) -> String {
     text
 }
 
-/// What is said of a log, and the model file that is written.
+/// What is said of a log, the model file that is written, and what that leaves of the readings, rms, in A.
 fn explained(log: &str) -> (Value, String, f64) {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
@@ -69,10 +69,10 @@ fn edges_at_the_rows_are_found_and_leave_lag_and_gain_what_they_are() {
         for (effect, truth) in effects.iter().zip([TAU_S, GAIN]) {
             let [low, high] =
                 [0, 1].map(|end| effect["parameters"][0]["ci95"][end].as_f64().unwrap());
-            // Half again for what noise does by chance.
-            let half = 0.75 * (high - low);
+            // Two and a half times the interval, for what noise does by chance.
+            let more = 0.75 * (high - low);
             assert!(
-                low - half <= truth && truth <= high + half,
+                low - more <= truth && truth <= high + more,
                 "{holds}: {effect}"
             );
         }

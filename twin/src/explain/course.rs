@@ -4,6 +4,7 @@ use std::borrow::Cow;
 
 use super::dropout::{self, Dropout};
 use super::fit::{self, Fit};
+use super::normal::dot;
 use super::slope;
 use super::unfitted::Unfitted;
 use super::workbench::{Member, Model, Workbench};
@@ -196,7 +197,7 @@ impl Course<'_> {
         if !self.problem.may_be_held() {
             return None;
         }
-        let squares = |fit: &Fit| fit.residual.iter().map(|r| r * r).sum::<f64>();
+        let squares = |fit: &Fit| dot(&fit.residual, &fit.residual);
         let straight = squares(&self.nearest(options)?);
         let held = Holds::ALL.into_iter().filter_map(|holds| {
             let course = self.with(self.problem.with_held_reference(holds), |other| {

@@ -97,20 +97,8 @@ impl Extension<'_> {
         {
             self.battery(battery);
         }
-        if self.shift.alignment_s != 0.0
-            && let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut)
-        {
-            add(sensor, "alignment_s", self.shift.alignment_s);
-        }
-        if self.shift.smooth_reference
-            && let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut)
-        {
-            set(sensor, "smooth_reference", value(true));
-        }
-        if let Some(holds) = self.shift.held_reference
-            && let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut)
-        {
-            set(sensor, "held_reference", value(holds.as_str()));
+        if let Some(sensor) = document.get_mut("sensor").and_then(Item::as_table_like_mut) {
+            self.sensor(sensor);
         }
         if !self.effects.is_empty() {
             self.effects(&mut document)?;
@@ -154,6 +142,18 @@ impl Extension<'_> {
             place.insert(&effect.id, Item::Table(table));
         }
         Ok(())
+    }
+
+    fn sensor(&self, table: &mut dyn TableLike) {
+        if self.shift.alignment_s != 0.0 {
+            add(table, "alignment_s", self.shift.alignment_s);
+        }
+        if self.shift.smooth_reference {
+            set(table, "smooth_reference", value(true));
+        }
+        if let Some(holds) = self.shift.held_reference {
+            set(table, "held_reference", value(holds.as_str()));
+        }
     }
 
     fn battery(&self, table: &mut dyn TableLike) {

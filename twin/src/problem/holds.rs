@@ -1,12 +1,15 @@
-//! A current that stays at one value between its rows, instead of going in a straight line.
+//! A reference that stays at one value between its rows, instead of going in a straight line.
+//!
+//! A straight line puts each edge of a load that goes in steps into the middle between two rows; a sensor that follows it late shows where
+//! it was.
 //!
 //! A cycler logs a step's last row when the step ends and the next step's first row one interval later. A straight line between the two
 //! counts half of that interval wrong. Where all intervals are alike the errors make up for one another at each return of the current;
 //! where a rest is logged more rarely than a load they add up, to what a load beside the recorded one or another capacity would do.
 
-use serde::{Deserialize, Serialize};
-
 use std::ops::Range;
+
+use serde::{Deserialize, Serialize};
 
 use super::{Base, Drive, Moments, Problem, Series, median_step_s};
 use crate::range::range;
@@ -19,7 +22,7 @@ const STAYS: f64 = 0.1;
 /// Where a step begins after the row before it, as a share of the time to the next one: a reading at that row is of before.
 const JUST_AFTER: f64 = 1e-6;
 
-/// Which of two rows a current belongs to.
+/// Which of two rows the value between them belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Holds {
