@@ -104,6 +104,8 @@ pub struct Converted {
     pub counts: Option<(Counts, Decoded)>,
     /// Channels of a measurement that could not be read, and why.
     pub left_out: Vec<String>,
+    /// What was read otherwise than it stands in the file.
+    pub notes: Vec<String>,
     content: Content,
 }
 
@@ -171,6 +173,7 @@ pub fn read(path: &Path, options: &Options, progress: &mut dyn FnMut(f64)) -> Re
                 format,
                 counts: None,
                 left_out,
+                notes: recording.table().notes().to_vec(),
                 content: Content::Table(recording.into_table()),
             });
         }
@@ -193,6 +196,7 @@ pub fn read(path: &Path, options: &Options, progress: &mut dyn FnMut(f64)) -> Re
         format,
         counts: Some((counts, decoded)),
         left_out: replaced(&options.mapping, &merged),
+        notes: Vec::new(),
         content: Content::Merged(merged.mapped(&options.mapping)?),
     })
 }
@@ -230,6 +234,7 @@ fn from_mdf(source: &str, bytes: &[u8], options: &Options) -> Result<Converted> 
         format: Format::Mdf,
         counts,
         left_out,
+        notes: Vec::new(),
         content: Content::Merged(merged.mapped(&options.mapping)?),
     })
 }

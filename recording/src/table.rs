@@ -5,8 +5,10 @@ use std::collections::HashSet;
 use crate::{
     error::{Error, Kind, Place, Result, listed, quoted},
     mapping::Mapping,
+    name,
     output::Columns,
     series::Recording,
+    unit::{self, ONE, Scale, Unit},
 };
 
 /// Columns of equal length, NaN where a value is missing. A table need not have time: an OCV curve has none.
@@ -18,6 +20,8 @@ pub struct Table {
     lines: Lines,
     /// Columns of the file that hold no numbers.
     left_out: Vec<LeftOut>,
+    /// What was read otherwise than it stands in the file.
+    notes: Vec<String>,
 }
 
 /// A column that is in the file and cannot be read as numbers: no fault, unless somebody needs it.
@@ -57,6 +61,10 @@ impl Lines {
 #[derive(Clone, Debug)]
 struct Column {
     name: String,
+    /// Its name in the file, where its unit's ending was added to it.
+    bare: Option<String>,
+    /// The unit that the file has for it beside its name; its numbers are in that.
+    unit: Option<&'static str>,
     /// Position in its file, from 0.
     position: usize,
     values: Vec<f64>,
@@ -117,6 +125,8 @@ impl Table {
             .enumerate()
             .map(|(position, (name, values))| Column {
                 name,
+                bare: None,
+                unit: None,
                 position,
                 values,
             })
@@ -126,6 +136,7 @@ impl Table {
             columns,
             lines,
             left_out: Vec::new(),
+            notes: Vec::new(),
         })
     }
 
@@ -136,6 +147,40 @@ impl Table {
         }
         self.left_out = left_out;
         self
+    }
+
+    /// With the units that the file has for columns (from 0): their numbers become those of ours, and their names end in it.
+    pub(crate) fn in_units(mut self, line: u64, units: &[Option<Unit>]) -> Self {
+        let mut told = Vec::new();
+        let mut taken: HashSet<String> = self.names().map(str::to_owned).collect();
+        for column in &mut self.columns {
+            let Some(Some(unit)) = units.get(column.position) else {
+                continue;
+            };
+            column.unit = Some(unit.symbol);
+            if unit.scale != ONE {
+                column.scale(unit.scale);
+                told.push(format!("{} {}", column.name, unit.scale));
+            }
+            let name = unit::column_name(&column.name, Some(*unit));
+            if taken.insert(name.clone()) {
+                column.bare = Some(std::mem::replace(&mut column.name, name));
+            }
+        }
+        if !told.is_empty() {
+            self.note(format!("in the units of line {line}: {}", told.join(", ")));
+        }
+        self
+    }
+
+    /// Adds what was read otherwise than it stands in the file.
+    pub(crate) fn note(&mut self, note: String) {
+        self.notes.push(note);
+    }
+
+    /// What was read otherwise than it stands in the file: lines above the names, units, encodings. Nothing of a canonical file.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// Columns that are in the file but hold no numbers, each with the reason.
@@ -221,9 +266,10 @@ impl Table {
     }
 
     /// The columns under the names that `mapping` gives them, a minus before one turning its sign; those it does not speak of keep
-    /// theirs.
+    /// theirs. A unit that the file states must be of the kind that the new name ends in, and is turned into it.
     pub fn mapped(mut self, mapping: &Mapping) -> Result<Self> {
         let mut columns = Vec::new();
+        let mut notes = Vec::new();
         let mut taken = HashSet::new();
         for (name, from) in mapping.pairs() {
             // A column's own name may begin with a minus.
@@ -241,6 +287,31 @@ impl Table {
                     .iter_mut()
                     .for_each(|value| *value = 0.0 - *value);
             }
+            if let Some(wanted) = name::unit(name) {
+                // What a line of units says is done already.
+                let stated = column
+                    .unit
+                    .is_none()
+                    .then(|| unit::stated(&column.name))
+                    .flatten();
+                let symbol = column.unit.or(stated.map(|stated| stated.symbol));
+                if let Some(symbol) = symbol.filter(|symbol| !unit::same(wanted, symbol)) {
+                    return Err(Error::new(
+                        Kind::Mapping,
+                        self.source.as_str(),
+                        Place::default(),
+                        format!("{} in {symbol}", quoted(from)),
+                        format!("{wanted}, as {} ends", quoted(name)),
+                    ));
+                }
+                if let Some(scale) = stated
+                    .map(|stated| stated.scale)
+                    .filter(|scale| *scale != ONE)
+                {
+                    mapped.scale(scale);
+                    notes.push(format!("{name} is {} {scale}", quoted(from)));
+                }
+            }
             taken.insert(column.name.clone());
             columns.push(mapped);
         }
@@ -256,6 +327,7 @@ impl Table {
         self.left_out
             .retain(|left| !named.contains(left.name.as_str()));
         self.columns = columns;
+        self.notes.append(&mut notes);
         Ok(self)
     }
 
@@ -287,7 +359,12 @@ impl Table {
     }
 
     fn find(&self, name: &str) -> Option<&Column> {
-        self.columns.iter().find(|column| column.name == name)
+        let whole = self.columns.iter().find(|column| column.name == name);
+        whole.or_else(|| {
+            self.columns
+                .iter()
+                .find(|column| column.bare.as_deref() == Some(name))
+        })
     }
 
     fn lacks(&self, name: &str) -> Error {
@@ -304,6 +381,14 @@ impl Table {
             format!("the columns {}", listed(self.names())),
             format!("a column {}", quoted(name)),
         )
+    }
+}
+
+impl Column {
+    fn scale(&mut self, scale: Scale) {
+        self.values
+            .iter_mut()
+            .for_each(|value| *value = scale.apply(*value));
     }
 }
 

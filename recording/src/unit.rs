@@ -1,5 +1,7 @@
 //! Units as databases and measurement files write them, turned into those that a column's name ends in.
 
+use std::fmt;
+
 use crate::name;
 
 /// How a number in a foreign unit becomes one in ours. Dividing and multiplying are kept apart: 4123 mV / 1000 is the
@@ -37,6 +39,15 @@ impl Scale {
     }
 }
 
+impl fmt::Display for Scale {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Times(factor) => write!(f, "· {factor}"),
+            Self::Over(divisor) => write!(f, "/ {divisor}"),
+        }
+    }
+}
+
 /// A unit that columns are given in.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Unit {
@@ -48,7 +59,8 @@ pub struct Unit {
     pub scale: Scale,
 }
 
-const ONE: Scale = Scale::Times(1.0);
+/// The numbers as they are.
+pub(crate) const ONE: Scale = Scale::Times(1.0);
 const KILO: Scale = Scale::Times(1e3);
 const MILLI: Scale = Scale::Over(1e3);
 const MICRO: Scale = Scale::Over(1e6);
@@ -97,6 +109,31 @@ pub fn known(text: &str) -> Option<Unit> {
     })
 }
 
+/// A unit as a line of units has it, without the brackets around it: `[mA]`, `(mA)`.
+pub(crate) fn without_brackets(text: &str) -> &str {
+    let text = text.trim();
+    [('[', ']'), ('(', ')')]
+        .into_iter()
+        .find_map(|(open, close)| text.strip_prefix(open)?.strip_suffix(close))
+        .unwrap_or(text)
+        .trim()
+}
+
+/// The unit that a name states after it: `Current [mA]`, `Current (mA)`, `I / mA`.
+pub(crate) fn stated(name: &str) -> Option<Unit> {
+    let name = name.trim_end();
+    let start = match name.chars().next_back()? {
+        ']' => name.rfind('[')?,
+        ')' => name.rfind('(')?,
+        _ => name.rfind('/')?,
+    };
+    let text = &name[start..];
+    known(
+        text.strip_prefix('/')
+            .unwrap_or_else(|| without_brackets(text)),
+    )
+}
+
 /// A signal's column name: its own if it ends in the unit already, else with the unit's ending.
 pub(crate) fn column_name(signal: &str, unit: Option<Unit>) -> String {
     match unit {
@@ -138,6 +175,23 @@ mod tests {
                 Some(unit.symbol),
                 "{text}"
             );
+        }
+    }
+
+    #[test]
+    fn a_name_may_state_its_unit() {
+        for name in [
+            "I [mA]",
+            "I(mA)",
+            "I / mA",
+            "I/mA ",
+            "a [b] [ mA ]",
+            "Zelle (3) (mA)",
+        ] {
+            assert_eq!(stated(name), known("mA"), "{name}");
+        }
+        for name in ["I", "I [rpm]", "mA]", "I mA", "", "I_mA", "[mA] I"] {
+            assert_eq!(stated(name), None, "{name}");
         }
     }
 

@@ -80,7 +80,7 @@ fn a_separator_that_a_spreadsheet_states_is_no_header() {
 /// Each fault with the sentence it is told in.
 #[test]
 fn every_fault_has_its_place() {
-    let cases: [(&str, Kind, &str); 32] = [
+    let cases: [(&str, Kind, &str); 33] = [
         (
             "",
             Kind::Empty,
@@ -141,24 +141,28 @@ fn every_fault_has_its_place() {
             Kind::NotANumber,
             "r.csv, line 4, column 2 (i_ref_a): found \"abc\", expected a number or an empty field",
         ),
-        // Times as clocks and calendars show them; thousands set apart by points are none.
+        // Times that have two meanings, or none; thousands set apart by points are none.
         (
-            "t_s,i_ref_a\n2026-03-29T00:50:00.000,1\n",
+            "t_s,i_ref_a\n03/29/2026 00:50:00,1\n",
             Kind::NotANumber,
-            "r.csv, line 2, column 1 (t_s): found \"2026-03-29T00:50:00.000\", expected a number or an empty field; times are numbers, in s, \
-             whatever they count from",
+            "r.csv, line 2, column 1 (t_s): found \"03/29/2026 00:50:00\", expected a number or an empty field; times are numbers, in s, or \
+             like 08:00:00.5, 2026-03-29 08:00:00.5 or 29.03.2026 08:00:00.5",
         ),
         (
-            "t_s;i_ref_a\n08:00:00,25;1\n",
+            "t_s,i_ref_a\n08:00:00,1\n08:00,2\n",
             Kind::NotANumber,
-            "r.csv, line 2, column 1 (t_s): found \"08:00:00,25\", expected a number or an empty field; times are numbers, in s, whatever \
-             they count from",
+            "r.csv, line 3, column 1 (t_s): found \"08:00\", expected a time like the column's first, 08:00:00.5, or an empty field",
+        ),
+        (
+            "t_s,i_ref_a\n2026-03-29 08:00:00,1\n1,2\n",
+            Kind::NotANumber,
+            "r.csv, line 3, column 1 (t_s): found \"1\", expected a time like the column's first, 2026-03-29 08:00:00.5, or an empty field",
         ),
         (
             "t_s,i_ref_a\n29.03.2026,1\n",
             Kind::NotANumber,
-            "r.csv, line 2, column 1 (t_s): found \"29.03.2026\", expected a number or an empty field; times are numbers, in s, whatever \
-             they count from",
+            "r.csv, line 2, column 1 (t_s): found \"29.03.2026\", expected a number or an empty field; times are numbers, in s, or like \
+             08:00:00.5, 2026-03-29 08:00:00.5 or 29.03.2026 08:00:00.5",
         ),
         (
             "t_s;i_ref_a\n1.234.567;1\n",
@@ -186,8 +190,9 @@ fn every_fault_has_its_place() {
             Kind::FieldCount,
             "r.csv, line 3: found 2 fields, expected one for each column of the header (the last line has no end: it may be cut)",
         ),
+        // A line about the file, and no names that fit what follows.
         (
-            "# logger 3\n# 2024-03-31\nt_s,i_ref_a\n0,1\n",
+            "# logger 3\n# 2024-03-31\nt_s,i_ref_a\n0,1,2\n",
             Kind::FieldCount,
             "r.csv, line 3: found 2 fields, expected one, as in line 1, which is taken for the header",
         ),
@@ -346,17 +351,28 @@ fn a_turned_zero_is_zero() {
 
 #[test]
 fn bytes_that_are_not_utf8_are_placed() {
-    let error = csv::parse("r.csv", b"t_s,x\n0,1\n1,\xff\n").unwrap_err();
-    assert_eq!(error.kind(), Kind::NotUtf8);
-    assert_eq!(
-        error.to_string(),
-        "r.csv, line 3: found the byte 0xff after 2 characters, expected UTF-8 text"
-    );
-    for in_utf_16 in [b"\xff\xfet\0_\0s\0", b"\xfe\xff\0t\0_\0s"] {
-        assert_eq!(
-            csv::parse("r.csv", in_utf_16).unwrap_err().to_string(),
-            "r.csv, line 1: found the byte order mark of UTF-16, expected UTF-8 text"
-        );
+    for (bytes, said) in [
+        // Damaged UTF-8 is no other encoding, and what has control characters is no text.
+        (
+            "t_s,T [\u{b0}C]\n0,1\n1,?\n".as_bytes(),
+            "r.csv, line 3: found the byte 0xff after 2 characters, expected UTF-8 text",
+        ),
+        (
+            b"t_s,x\n0,1\n\0,?\n",
+            "r.csv, line 3: found the byte 0xff after 2 characters, expected UTF-8 text",
+        ),
+        (
+            b"?\xfet\0_\0s\0\n",
+            "r.csv: found the byte order mark of UTF-16, and after it what is none, expected whole characters (the file may be cut)",
+        ),
+    ] {
+        let bytes: Vec<u8> = bytes
+            .iter()
+            .map(|byte| if *byte == b'?' { 0xFF } else { *byte })
+            .collect();
+        let error = csv::parse("r.csv", &bytes).unwrap_err();
+        assert_eq!(error.kind(), Kind::NotUtf8);
+        assert_eq!(error.to_string(), said);
     }
 }
 

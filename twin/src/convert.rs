@@ -106,6 +106,9 @@ fn summary(arguments: &Arguments, converted: &Converted) -> String {
             }
         }
     }
+    for note in &converted.notes {
+        text.push_str(&format!("\n{note}"));
+    }
     if !converted.left_out.is_empty() {
         text.push_str(&format!("\nleft out: {}", converted.left_out.join(", ")));
     }

@@ -172,6 +172,9 @@ pub fn prepare(model: &Model, inputs: &Inputs, purpose: Purpose) -> Result<Prepa
         for remark in frame.remarks() {
             work.remark(remark.clone());
         }
+        if !frame.notes().is_empty() {
+            work.remark(format!("{}: {}", frame.source(), frame.notes().join("; ")));
+        }
         let left_out = frame.left_out();
         if !left_out.is_empty() {
             work.remark(format!(

@@ -21,6 +21,7 @@ use super::fit::{Fit, fit, in_the_mean, other_minimum, polish};
 use super::screen::{DRAWS, Entry, screen};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::find;
+use crate::report::format::precise_percent;
 use grow::addition;
 use losses::share;
 use obstacle::{FLOOR, obstacle};
@@ -270,7 +271,7 @@ impl Search<'_, '_> {
         self.refused.push(format!(
             "{}: takes {} of the held-out error, and so would any of {}",
             now.model.members[vague.index].id(),
-            percent(vague.held_out_gain),
+            precise_percent(vague.held_out_gain),
             vague.equivalent.join(", ")
         ));
         let now = fit(self.bench, &now.model.without(vague.index), None);
@@ -329,8 +330,8 @@ impl Search<'_, '_> {
                 let why = if missed <= placebos {
                     format!(
                         "takes only {} of the held-out error, placebos up to {}",
-                        percent(missed),
-                        percent(placebos)
+                        precise_percent(missed),
+                        precise_percent(placebos)
                     )
                 } else {
                     obstacle(bench, &without, here, index, missed)?
@@ -340,7 +341,7 @@ impl Search<'_, '_> {
             for (id, p99) in anew {
                 self.decisions.push(format!(
                     "{id} kept, with the others there: placebos take {} beside them.",
-                    percent(p99)
+                    precise_percent(p99)
                 ));
                 self.limit(id, p99);
             }
@@ -362,14 +363,4 @@ fn p99_of(placebo_p99: &[(&'static str, f64)], id: &str) -> f64 {
         .iter()
         .find(|(known, _)| *known == id)
         .map_or(0.0, |(_, p99)| *p99)
-}
-
-/// A share in percent, short.
-pub fn percent(share: f64) -> String {
-    // What is next to nothing is no measure.
-    if share.abs() < 1e4 {
-        format!("{:.3} %", 100.0 * share).replace(".000 %", " %")
-    } else {
-        "more than any".into()
-    }
 }

@@ -8,6 +8,7 @@ use super::told::short;
 use super::workbench::{Member, Workbench};
 use crate::effects::Effect;
 use crate::report::data::Verdict;
+use crate::report::format::precise_percent;
 
 /// Times the stated noise that noise never is.
 pub const STRAY: f64 = 8.0;
@@ -176,7 +177,7 @@ pub(super) fn name_by_place(bench: &Workbench<'_>, selection: &mut Selection) ->
     let (count, are) = placed.strays.counted();
     let place = format!(
         "{count} {are} off by more than {STRAY} times the stated noise, next to where alone it acts (by chance {}), and it takes all of that",
-        select::percent(placed.chance)
+        precise_percent(placed.chance)
     );
     selection
         .decisions

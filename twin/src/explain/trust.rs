@@ -3,13 +3,14 @@
 use super::fit::{self, Fit};
 use super::intervals::{self, Variation};
 use super::robust::loss;
-use super::select::{self, Selection, percent};
+use super::select::{self, Selection};
 use super::told::short;
 use super::unfitted::{Unfitted, confirmed};
 use super::workbench::{Member, Model, Workbench};
 use crate::effects::scene::Scale;
 use crate::effects::{IDEALISED, Parameter, Search, find};
 use crate::problem::Base;
+use crate::report::format::precise_percent;
 
 /// An effect whose values would have to differ from stretch to stretch by so many times what equations may be off by (14 % of it,
 /// rms, of a sensor's; 28 % of a battery's) is not what is there: true ones of other people's circuits and cells stay below.
@@ -58,7 +59,7 @@ pub(super) fn wavering(
         refused.push(id);
         selection.refused.push(format!(
             "{id}: fits, but its values would have to differ by {} from stretch to stretch, {:.0} standard deviations more than noise: what is there is not constant",
-            percent(variation.share.sqrt()),
+            precise_percent(variation.share.sqrt()),
             variation.deviations
         ));
         let steady = |fit: &Fit| {

@@ -5,7 +5,7 @@ use super::flexible::{Explainable, Features};
 use super::normal::dot;
 use super::quieter::only_quietens;
 use super::robust::{common, spread};
-use super::select::{self, Selection, percent};
+use super::select::{self, Selection};
 use super::slope::change;
 use super::strays::{STRAY, noise_is_stated, slipped, strays};
 use super::told::short;
@@ -13,6 +13,7 @@ use super::workbench::{Member, Model, Workbench};
 use super::{Held, intervals, jumps, rms};
 use crate::problem::{Accuracy, Coloured, View};
 use crate::report::data::Verdict;
+use crate::report::format::precise_percent;
 
 /// Structure left beside the named effects makes the explanation a partial one from this share of the residual on.
 const LEFT: f64 = 0.04;
@@ -102,9 +103,9 @@ pub(super) fn judge(
     if smooth > 0.0 {
         selection.decisions.push(format!(
             "Structure is left: a smooth function of the recorded inputs would take {} of what remains (placebos up to {}), {} of what the named effects take.",
-            percent(left.share),
-            percent(left.placebo_most),
-            percent(smooth / explained.max(1e-300))
+            precise_percent(left.share),
+            precise_percent(left.placebo_most),
+            precise_percent(smooth / explained.max(1e-300))
         ));
     }
     if beyond > 0.0 || drift > 0.0 || loud {
@@ -231,8 +232,8 @@ fn without_names(bench: &Workbench<'_>, selection: &mut Selection, before: Expla
     {
         selection.decisions.push(format!(
             "No effect passes, yet a smooth function of the recorded inputs takes {} of the held-out error (placebos up to {}): unknown.",
-            percent(before.share),
-            percent(before.placebo_most)
+            precise_percent(before.share),
+            precise_percent(before.placebo_most)
         ));
         Verdict::Unknown
     } else if let Some(strays) = strays(bench, residual).filter(|strays| strays.decide) {
@@ -388,7 +389,10 @@ pub(super) fn doubt(
         .collect();
     for (share, real, what) in signs {
         if real && share > DOUBTED {
-            doubts.push(format!("{what} {} of its change", percent(share.sqrt())));
+            doubts.push(format!(
+                "{what} {} of its change",
+                precise_percent(share.sqrt())
+            ));
         }
     }
     let elsewhere = not_there.as_ref().map_or(0.0, |(share, _)| *share);

@@ -99,6 +99,11 @@ impl Frame {
         &self.remarks
     }
 
+    /// What was read otherwise than it stands in the file.
+    pub fn notes(&self) -> &[String] {
+        self.recording.table().notes()
+    }
+
     /// Columns that are in the file and hold no numbers, each with the reason.
     pub fn left_out(&self) -> Vec<String> {
         self.recording.table().left_out()

@@ -111,6 +111,16 @@ pub fn percent(share: f64) -> String {
     }
 }
 
+/// A share in per cent to a thousandth, for reasons that are a matter of those.
+pub fn precise_percent(share: f64) -> String {
+    // What is next to nothing is no measure.
+    if share.abs() < 1e4 {
+        format!("{:.3} %", 100.0 * share).replace(".000 %", " %")
+    } else {
+        "more than any".into()
+    }
+}
+
 /// The change from `before` to `after`, in per cent of `before`; empty where there is no such thing.
 pub fn change(before: f64, after: f64) -> String {
     if !(before.is_finite() && after.is_finite() && before > 0.0) {

@@ -4,12 +4,13 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use super::MOST_EFFECTS;
 use super::losses::{losses, share};
 use super::obstacle::{FLOOR, obstacle, only_aligns};
-use super::{MOST_EFFECTS, percent};
 use crate::explain::fit::{Fit, fit};
 use crate::explain::screen::{DRAWS, Entry, Screening, replaced, screen};
 use crate::explain::workbench::{Member, Model, Workbench};
+use crate::report::format::precise_percent;
 
 /// Candidates that are fitted after screening.
 pub(super) const FITTED: usize = 8;
@@ -229,8 +230,8 @@ fn step(
                 refused,
                 format!(
                     "{id}: takes {} of the held-out error, placebos up to {}",
-                    percent(gain),
-                    percent(placebo_p99)
+                    precise_percent(gain),
+                    precise_percent(placebo_p99)
                 ),
             );
             continue;
@@ -240,9 +241,9 @@ fn step(
             None => {
                 decisions.push(format!(
                     "{id} added: takes {} of the held-out error; the best of {} placebos of the whole library takes {} (99th percentile).",
-                    percent(gain),
+                    precise_percent(gain),
                     DRAWS,
-                    percent(placebo_p99)
+                    precise_percent(placebo_p99)
                 ));
                 return Some((better, placebo_p99));
             }
@@ -327,7 +328,7 @@ fn pair(
         "{} and {} added together: both take {} of the held-out error, more than any one alone and than placebos.",
         ids[count - 2],
         ids[count - 1],
-        percent(share(bench, now, &best))
+        precise_percent(share(bench, now, &best))
     ));
     Some((best, placebo_p99))
 }
@@ -351,8 +352,8 @@ fn unfit(
     if gain <= least {
         return Some(format!(
             "takes {} of the held-out error; two placebos, or the practical floor: {}",
-            percent(gain),
-            percent(least)
+            precise_percent(gain),
+            precise_percent(least)
         ));
     }
     if single.is_some_and(|single| share(bench, single, best) < MUCH) {
@@ -365,8 +366,8 @@ fn unfit(
         let why = if missed <= p99 {
             Some(format!(
                 "takes {}, placebos up to {}",
-                percent(missed),
-                percent(p99)
+                precise_percent(missed),
+                precise_percent(p99)
             ))
         } else if only_aligns(bench, &alone, best, index) {
             Some("only aligns the samples".into())

@@ -1,12 +1,13 @@
 //! What the readings themselves show without any simulation: a grid of values, a rail.
 
+use super::Named;
 use super::losses::share;
 use super::obstacle::{CERTAIN, FLOOR, obstacle};
-use super::{Named, percent};
 use crate::explain::fit::{Fit, fit};
 use crate::explain::normal::dot;
 use crate::explain::robust::loss;
 use crate::explain::workbench::{Member, Workbench};
+use crate::report::format::precise_percent;
 
 /// A simulation that is rounded may be off by this many times the variance of rounding more than one that is not: by once where
 /// noise is as loud as a step, and chance.
@@ -79,7 +80,7 @@ pub(super) fn marked(
             "{} added: the readings {}; that makes {} of the residual's energy.",
             card.id,
             mark.what,
-            percent(gain)
+            precise_percent(gain)
         ));
         let found = named
             .iter()

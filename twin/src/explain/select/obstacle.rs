@@ -1,6 +1,5 @@
 //! Why an effect that fits is not named: too small, within what is accurate, or at the end of what is physics.
 
-use super::percent;
 use crate::effects::{Effect, Search, Stage};
 use crate::explain::fit::Fit;
 use crate::explain::normal::dot;
@@ -10,6 +9,7 @@ use crate::explain::slope::change;
 use crate::explain::told::short;
 use crate::explain::verdict::{STATED, allowed, unavoidable};
 use crate::explain::workbench::{Member, Model, Workbench};
+use crate::report::format::precise_percent;
 
 /// A named effect takes away at least this share of the held-out squared error (2 % of the held-out rms), overall or where it
 /// acts.
@@ -88,9 +88,9 @@ pub(super) fn small(
     if gain < FLOOR && there < PLACE {
         return Some(format!(
             "real, but takes only {} of the held-out error ({} where it acts), below the practical floor of {}",
-            percent(gain),
-            percent(there),
-            percent(FLOOR)
+            precise_percent(gain),
+            precise_percent(there),
+            precise_percent(FLOOR)
         ));
     }
     let beside = beside(bench, after, index);

@@ -2,10 +2,10 @@
 
 use rayon::prelude::*;
 
+use super::Named;
 use super::grow::{FITTED, STARTS, added, fits};
 use super::losses::{beaten, losses, share};
 use super::obstacle::{apart, at_end, beside, obstacle, only_aligns, small};
-use super::{Named, percent};
 use crate::effects::{Effect, find};
 use crate::explain::fit::{Fit, fit, other_minimum};
 use crate::explain::quieter::only_quietens;
@@ -13,6 +13,7 @@ use crate::explain::robust::loss;
 use crate::explain::screen::screen;
 use crate::explain::workbench::{Member, Model, Workbench};
 use crate::problem::Base;
+use crate::report::format::precise_percent;
 
 /// A rival is fitted if its start takes this share of what the effect takes whose place it would have. Of 830 that took half as
 /// much in the end, all but eight began so (counted once, on 149 cases of the campaign's `--seeds 0`).
@@ -212,7 +213,7 @@ pub(super) fn swap(
         "{} replaced by {}: the held-out error is lower by {}.",
         now.model.members[index].id(),
         best.model.ids()[new(now, best)..].join(" and "),
-        percent((here - loss) / here)
+        precise_percent((here - loss) / here)
     ));
     Some((index, best.clone()))
 }
