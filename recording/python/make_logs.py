@@ -19,6 +19,7 @@ import asammdf
 import can
 import cantools
 import numpy
+import pandas
 import pyarrow
 import pyarrow.parquet
 
@@ -318,6 +319,38 @@ def make_tables(out, rng):
                     writer.writerow([0, repr(row * 0.001), name, repr(float(value))])
 
 
+def make_texts(out, rng):
+    """One table as pandas writes it for spreadsheets of several kinds, below what loggers put above their names."""
+    rows = 2_000
+    some = lambda value: None if rng.random() < 0.2 else value
+    start = pandas.Timestamp("2026-02-28 23:59:30")
+    table = pandas.DataFrame(
+        {
+            "Zeit": [start + pandas.Timedelta(milliseconds=50 * i) for i in range(rows)],
+            "Strom [mA]": [some(rng.gauss(0, 1e5)) for _ in range(rows)],
+            "Temperatur (°C)": [some(rng.gauss(25, 1)) for _ in range(rows)],
+            "Anmerkung; frei": [some('läuft, "sehr" gut') for _ in range(rows)],
+        }
+    )
+    ways = {
+        "text-comma": ("utf-8", dict()),
+        "text-german": ("cp1252", dict(sep=";", decimal=",", date_format="%d.%m.%Y %H:%M:%S,%f")),
+        "text-tabs": ("utf-16", dict(sep="\t", date_format="%Y-%m-%dT%H:%M:%S.%f")),
+        "text-clock": ("utf-8", dict(sep=";", date_format="%H:%M:%S.%f")),
+    }
+    for name, (encoding, how) in ways.items():
+        with open(out / f"{name}.csv", "w", newline="", encoding=encoding) as file:
+            file.write("Logger 3;Prüfstand 7\r\nSeriennummer;1234\r\n\r\n")
+            table.to_csv(file, index=False, lineterminator="\r\n", **how)
+    with open(out / "text.expected.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["group", "t_s", "column", "value"])
+        for column, name, factor in [("Strom [mA]", "i_ref_a", 1e3), ("Temperatur (°C)", "temp_cell_c", 1.0)]:
+            for row, value in enumerate(table[column]):
+                if not pandas.isna(value):
+                    writer.writerow([0, repr(row * 0.05), name, repr(float(value) / factor)])
+
+
 def main():
     if len(sys.argv) != 3:
         print(__doc__, file=sys.stderr)
@@ -329,6 +362,7 @@ def main():
     make_frames(out, "board", board, rng)
     make_measurements(out, rng)
     make_tables(out, rng)
+    make_texts(out, rng)
     (out / "complete").write_text("")
     return 0
 

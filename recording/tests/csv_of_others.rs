@@ -26,6 +26,7 @@ fn lines_about_the_file_stand_above_its_names() {
         "Test,US06\nOperator,Meier\n\n",
         "Start;29.03.2026 08:00:00\nRate;100\n",
         "Logger 3,\nSerial,1234\n,\n",
+        "Logger;bench 7\nSerial;1234\n\n",
         "Note: a, b, c and d\n",
         "1\n2\n",
     ] {

@@ -1,4 +1,4 @@
-//! Files written by python-can, asammdf and pyarrow, against what cantools, asammdf and pyarrow say is in them.
+//! Files written by python-can, asammdf, pyarrow and pandas, against what cantools, asammdf, pyarrow and pandas say is in them.
 //!
 //! `recording/python/make_logs.py` makes them. They are looked for in `HALLMARK_FOREIGN_LOGS`, or in `foreign-logs`
 //! of the target directory.
@@ -13,7 +13,7 @@ use std::{
 };
 
 use recording::{
-    Table,
+    Mapping, Table,
     convert::{self, Converted, Format, Options},
     csv,
     dbc::Database,
@@ -214,6 +214,50 @@ fn tables_of_any_type_of_number() {
         // Moments count from the first one, theirs are dates.
         assert_eq!(ours.remove("date").unwrap()[0].1, 0.0);
         compare(&file, &ours, &theirs);
+    }
+}
+
+#[test]
+fn texts_that_pandas_writes_for_spreadsheets() {
+    let folder = folder();
+    let theirs = expected(&folder.join("text.expected.csv"));
+    let columns = [
+        "t_s=Zeit",
+        "i_ref_a=Strom [mA]",
+        "temp_cell_c=Temperatur (°C)",
+    ];
+    for (name, from_s, encoding) in [
+        ("text-comma", 0.0, None),
+        ("text-german", 0.0, Some("Windows-1252")),
+        ("text-tabs", 0.0, Some("UTF-16")),
+        // Over midnight.
+        ("text-clock", 86_370.0, None),
+    ] {
+        let options = Options {
+            mapping: Mapping::parse(columns).unwrap(),
+            ..Options::default()
+        };
+        let path = folder.join(format!("{name}.csv"));
+        let converted = convert::read(&path, &options, &mut |_| {}).unwrap();
+        assert_eq!(converted.format, Format::Csv);
+        let [left_out] = converted.left_out.as_slice() else {
+            panic!("{:?}", converted.left_out);
+        };
+        assert!(
+            left_out.starts_with("Anmerkung; frei (\"läuft, "),
+            "{left_out}"
+        );
+        let encoding = encoding.map(|encoding| format!("read as {encoding}, for it is not UTF-8"));
+        let rest = [
+            "the columns' names are in line 4, what stands above them is not read",
+            "i_ref_a is \"Strom [mA]\" / 1000",
+        ];
+        let told: Vec<_> = encoding
+            .into_iter()
+            .chain(rest.map(str::to_owned))
+            .collect();
+        assert_eq!(converted.notes, told, "{name}");
+        compare(name, &samples(&table(&converted), from_s), &theirs);
     }
 }
 

@@ -14,6 +14,9 @@ use crate::{
 /// Lines in which the names are looked for.
 const LOOKED_AT: usize = 200;
 
+/// Rows that tell names from lines about the file, which may look like a name and a number.
+const ROWS: usize = 8;
+
 /// The names and what was found with them.
 pub(super) struct Head {
     /// The names' line.
@@ -30,7 +33,7 @@ pub(super) struct Head {
 
 /// Finds the names, and the lines of rows after them.
 ///
-/// The first line has them, unless what follows does not fit it: then the first line of names that a row of as many fields follows.
+/// The first line has them, unless what follows does not fit it: then the first line of names that rows of as many fields follow.
 pub(super) fn find<'a>(source: &str, text: &'a str) -> Result<(Head, Lines<'a>)> {
     let mut lines = Lines::new(text);
     let mut first = lines.next();
@@ -55,14 +58,19 @@ pub(super) fn find<'a>(source: &str, text: &'a str) -> Result<(Head, Lines<'a>)>
         ));
     };
     let mut chosen = Candidate::of(stated, first_line, first, &lines);
-    if chosen.fit == Fit::None && !chosen.is_above_rows(&lines) {
+    if !(chosen.has_rows() && chosen.fit == Fit::All) && !chosen.is_above_numbers(&lines) {
         let mut rest = lines.clone();
         for _ in 0..LOOKED_AT {
             let Some((line, text)) = rest.next() else {
                 break;
             };
             let candidate = Candidate::of(stated, line, text, &rest);
-            if candidate.names > 1 && candidate.fit >= Fit::Some {
+            let is_better = candidate.fit > chosen.fit || !chosen.has_rows();
+            if candidate.names > 1
+                && candidate.fit >= Fit::Some
+                && candidate.has_rows()
+                && is_better
+            {
                 chosen = candidate;
                 lines = rest;
                 break;
@@ -127,6 +135,8 @@ struct Candidate<'a> {
     /// How many there are.
     names: usize,
     fit: Fit,
+    /// The lines after that row have as many fields as well.
+    goes_on: bool,
     units: Option<(u64, Vec<Option<Unit>>)>,
 }
 
@@ -146,7 +156,9 @@ impl<'a> Candidate<'a> {
         let mut best: Option<Self> = None;
         for separator in separators {
             let candidate = Self::with(separator, line, text, after);
-            if best.as_ref().is_none_or(|best| best.fit < candidate.fit) {
+            let is_better =
+                |best: &Self| (best.has_rows(), best.fit) < (candidate.has_rows(), candidate.fit);
+            if best.as_ref().is_none_or(is_better) {
                 best = Some(candidate);
             }
         }
@@ -165,6 +177,7 @@ impl<'a> Candidate<'a> {
             separator,
             names: names.iter().filter(|name| !name.is_empty()).count(),
             fit: Fit::None,
+            goes_on: false,
             units: None,
         };
         if are_names {
@@ -172,17 +185,25 @@ impl<'a> Candidate<'a> {
             let next = after.next();
             candidate.fit = fit(&names, next, separator);
             if let (Fit::None | Fit::Some, Some((line, text))) = (candidate.fit, next)
-                && let Some(units) = units(text, after.next(), &names, separator)
+                && let Some(units) = units(text, after.clone().next(), &names, separator)
             {
                 candidate.fit = Fit::All;
                 candidate.units = Some((line, units));
+                after.next();
             }
+            let mut more = after.take(ROWS - 1);
+            candidate.goes_on =
+                more.all(|(_, text)| Fields::new(text, separator).count() == names.len());
         }
         candidate
     }
 
+    fn has_rows(&self) -> bool {
+        self.fit != Fit::None && self.goes_on
+    }
+
     /// Names of some columns with numbers below, if not as many: that is a broken row, and no line about the file.
-    fn is_above_rows(&self, after: &Lines<'_>) -> bool {
+    fn is_above_numbers(&self, after: &Lines<'_>) -> bool {
         let next = after.clone().next();
         self.names > 1
             && next.is_some_and(|(_, text)| {
