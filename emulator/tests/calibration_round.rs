@@ -2,8 +2,6 @@
 //!
 //! The image as `rig::default_image` finds it; `cargo xtask test` builds it.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
 use std::f64::consts::TAU;
 use std::fmt::Write as _;
 use std::fs;

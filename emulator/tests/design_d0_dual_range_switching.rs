@@ -1,14 +1,10 @@
 //! D0 on the running image: ramps through ±53.33 A in both directions. Which sensor measures, what the frames say on both
 //! sides of an edge and across it, and what the meter has counted.
 
-#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod support;
-
+use crate::support::{Account, Bench, firmware};
 use emulator::bus_view::validity;
 use emulator::rig::Setup;
 use emulator::scenario::{Contactors, Row, Scenario};
-use support::{Account, Bench, firmware};
 
 /// Where the comparators trip: 4.5 V is 2 V above the zero, of 2.25 V for 60 A (D0: 53.33 A).
 const TRIP_A: f64 = 2.0 * 60.0 / 2.25;

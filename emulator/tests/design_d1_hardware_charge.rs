@@ -4,19 +4,15 @@
 //! The drive is 12 s of US06 on a Panasonic 18650PF (recordings/panasonic-18650pf, P. Kollmeyer, CC BY 4.0), multiplied
 //! by 19: 96 A of charge to 370 A of discharge.
 
-#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod support;
-
 use std::path::Path;
 
+use crate::support::{Account, Bench, Charge, firmware};
 use emulator::mcu::rcc::ResetCause;
 use emulator::profile::{self, ProfileOptions};
 use emulator::rig::Setup;
 use emulator::scenario::{Contactors, Row, Scenario};
 use emulator::time::Ticks;
 use recording::Mapping;
-use support::{Account, Bench, Charge, firmware};
 
 const LENGTH_S: f64 = 12.0;
 

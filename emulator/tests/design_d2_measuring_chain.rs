@@ -1,17 +1,13 @@
 //! D2 on the running image: HAH1BV, ADS1100, zero drift set over RS485, sliding average on CAN; what is set survives a
 //! reset and a power cycle.
 
-#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod support;
-
+use crate::support::{Bench, Ended, firmware};
 use emulator::mcu::rcc::ResetCause;
 use emulator::rig::{Firmware, Setup};
 use emulator::scenario::{Contactors, Key, Row, Scenario};
 use plant::front_end::{FrontEndConfig, Sensors};
 use plant::hall::{HallSensorConfig, NoiseConfig};
 use rmodbus::ErrorKind;
-use support::{Bench, Ended, firmware};
 
 /// 4 mV per ampere (D2).
 const V_PER_A: f64 = 0.004;

@@ -1,16 +1,12 @@
 //! D3 on the running image: a sensor that comes off, told from one that reads a current.
 
-#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod support;
-
+use crate::support::{Bench, Ended, firmware};
 use emulator::bus_view::validity;
 use emulator::mcu::rcc::ResetCause;
 use emulator::rig::{Firmware, Setup};
 use emulator::scenario::{Contactors, Key, Row, Scenario};
 use plant::front_end::{Faults, FrontEndConfig, SensorFault};
 use plant::network::NetworkConfig;
-use support::{Bench, Ended, firmware};
 
 /// The state of the key-state calibration on CAN.
 const TAKEN: f64 = 2.0;

@@ -1,17 +1,13 @@
 //! D4 on the running image: factors by key state with the high-voltage permit held back until they are taken, and the
 //! supply sweep over RS485.
 
-#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod support;
-
+use crate::support::{Bench, Ended, firmware};
 use emulator::bus_view::Reading;
 use emulator::mcu::rcc::ResetCause;
 use emulator::rig::{Firmware, Setup};
 use emulator::scenario::{Contactors, Key, Row, Scenario};
 use plant::front_end::{FrontEndConfig, Sensors};
 use plant::hall::{HallSensorConfig, NoiseConfig, Transfer};
-use support::{Bench, Ended, firmware};
 
 /// Turns ratio of the sensor (*assumed*, as in the plant and in the firmware's factory values).
 const TURNS: f64 = 2_000.0;

@@ -2,10 +2,7 @@
 //! names both methods), kept over a reset. The battery is the plant's: 40 strings of the Panasonic 18650PF with
 //! polarisation and hysteresis, whose voltage has not quite come to rest after the shortest rest that can be set.
 
-#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod support;
-
+use crate::support::{Bench, Ended, firmware};
 use core_logic::retained::{RetainedState, SLOT_WORDS, from_words, to_words};
 use core_logic::units::Nanocoulombs;
 use emulator::bus_view::validity;
@@ -14,7 +11,6 @@ use emulator::mcu::rcc::ResetCause;
 use emulator::scenario::{Contactors, Row};
 use plant::ade7753::Flip;
 use plant::battery::{Battery, BatteryConfig};
-use support::{Bench, firmware};
 
 const STRINGS: f64 = 40.0;
 /// The ADE7753's register CHKSUM.
@@ -119,7 +115,7 @@ fn rest_after_a_drive_re_anchors_the_state_of_charge_which_survives_a_reset() {
     bench.set("stability window", &[STABLE_S as i64]);
     bench.set("open-circuit uncertainty", &[(OCV_WITHIN_V * 1e6) as i64]);
     bench.set("presented slew", &[10_000]);
-    assert_eq!(bench.command("save", 2.0), support::Ended::Done);
+    assert_eq!(bench.command("save", 2.0), Ended::Done);
     bench.run(0.3);
     believe(&mut bench, capacity_ah * 3600.0);
     bench.rig.machine.reset(ResetCause::Software);

@@ -2,8 +2,6 @@
 //!
 //! The image as `rig::default_image` finds it; `cargo xtask test` builds it.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
 use std::collections::HashMap;
 use std::fs;
 use std::path::Path;

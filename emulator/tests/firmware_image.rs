@@ -2,8 +2,6 @@
 //!
 //! The image as `rig::default_image` finds it.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
 use core_logic::can::layout::{Direction, MESSAGES, Message};
 use emulator::can_frame::CanFrame;
 use emulator::faults::Fault;

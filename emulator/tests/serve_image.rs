@@ -2,15 +2,11 @@
 //!
 //! `HALLMARK_PYTHON` as in `serve_python.rs`; the image as `rig::default_image` finds it.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod serve_support;
-
 use std::process::Command;
 
+use crate::serve_support::{Running, project};
 use emulator::rig::{Firmware, Rig, Setup};
 use emulator::scenario::{Contactors, Key, Row, Scenario};
-use serve_support::{Running, project};
 
 /// Longer than docs/firmware.md gives the start: 450 ms for the storage, 100 ms for the test of the meter.
 const START_S: f64 = 1.0;

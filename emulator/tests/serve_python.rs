@@ -3,15 +3,11 @@
 //! `HALLMARK_PYTHON` names a Python that has `emulator/clients/requirements.txt`; `cargo xtask test` makes one and sets it.
 //! Each client is also run against boards with a fault: what it does not find there it would not find on the real one.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod serve_support;
-
 use std::fmt::Write as _;
 use std::process::{Command, Output};
 
+use crate::serve_support::{FakeBoard, Fault, Running, project};
 use emulator::serve::Board;
-use serve_support::{FakeBoard, Fault, Running, project};
 
 fn client(program: &str) -> Command {
     let python = std::env::var_os("HALLMARK_PYTHON").expect(

@@ -1,18 +1,14 @@
 //! The session between clients and a board, over real sockets and a real terminal.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
-mod serve_support;
-
 use std::fs::File;
 use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
+use crate::serve_support::{FakeBoard, Fault, Running, options};
 use emulator::can_frame::CanFrame;
 use emulator::serve::{Board, Session};
-use serve_support::{FakeBoard, Fault, Running, options};
 
 /// Reads the map version: the example of a request in *MODBUS over Serial Line*, with this map's address. Its CRC and that
 /// of the answer by an independent calculation.

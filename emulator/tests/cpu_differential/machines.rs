@@ -11,7 +11,7 @@ use emulator::cpu::Cpu;
 use object::{Object, ObjectSegment};
 use rsemu::core::space::{AddressSpace, RamStore, Region};
 
-use crate::sequences::{self, HEADER, Random, SLOT};
+use super::sequences::{self, HEADER, Random, SLOT};
 
 const RAM: u32 = 0x2000_0000;
 const MEMORY_BYTES: u64 = 4 << 20;

@@ -9,7 +9,7 @@ use emulator::time::Ticks;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-use crate::bench::*;
+use super::bench::*;
 
 fn is_off(rig: &mut Rig<'_>) -> bool {
     rig.machine

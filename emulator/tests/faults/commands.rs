@@ -4,7 +4,7 @@ use emulator::rig::{Rig, Setup};
 use emulator::scenario::{Contactors, Key, Scenario};
 use plant::front_end::SensorFault;
 
-use crate::bench::*;
+use super::bench::*;
 
 /// Zero drift of the small sensor, in µA.
 fn zero_drift(rig: &mut Rig<'_>) -> i32 {

@@ -7,7 +7,7 @@ use emulator::rig::{Rig, Setup};
 use emulator::scenario::{Contactors, Scenario};
 use emulator::time::Ticks;
 
-use crate::bench::*;
+use super::bench::*;
 
 /// One conversion at 32 per second, in s.
 const PERIOD_S: f64 = 1.0 / 32.0;

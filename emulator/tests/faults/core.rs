@@ -8,7 +8,7 @@ use emulator::scenario::{Contactors, Scenario};
 use emulator::time::Ticks;
 use plant::ade7753::Flip;
 
-use crate::bench::*;
+use super::bench::*;
 
 #[test]
 fn fault_f22_a_flipped_bit_of_the_configuration_is_found_and_defaults_take_over() {

@@ -10,7 +10,7 @@ use plant::w25q32::{SECTOR, Timing};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-use crate::bench::*;
+use super::bench::*;
 
 /// Register of the battery's capacity: two words, writable at any time, and it means nothing to these tests.
 const CAPACITY: u16 = 0x0700;

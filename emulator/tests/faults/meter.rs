@@ -3,7 +3,7 @@
 use core_logic::range::Range;
 use plant::ade7753::{Flip, Transaction};
 
-use crate::bench::*;
+use super::bench::*;
 
 const CHECKSUM: u8 = 0x3E;
 

@@ -4,7 +4,7 @@ use core_logic::error_budget::{hand_over_hidden, hand_over_latency};
 use core_logic::range::Range;
 use emulator::bus_view::validity;
 
-use crate::bench::*;
+use super::bench::*;
 
 /// Changes of the range as the board has counted them, and pairs of them that it knows it has not seen one by one.
 fn edges(rig: &mut emulator::rig::Rig<'_>) -> (u32, u32) {

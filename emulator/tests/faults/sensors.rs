@@ -2,7 +2,7 @@
 
 use emulator::bus_view::validity;
 
-use crate::bench::*;
+use super::bench::*;
 
 #[test]
 fn fault_f14_an_open_sensor_at_a_rail_is_found() {

@@ -3,8 +3,6 @@
 //! Both run `emulator/cpu-programs`. QEMU runs the random sequences undisturbed; the emulated core also with interrupts
 //! between any two instructions, whose handlers spoil what an exception saves: afterwards nobody may be able to tell.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
-
 mod machines;
 mod sequences;
 
