@@ -63,7 +63,7 @@ struct Column {
     name: String,
     /// Its name in the file, where its unit's ending was added to it.
     bare: Option<String>,
-    /// The unit that the file has for it beside its name; its numbers are in that.
+    /// What its numbers are in, where that is known from more than its name.
     unit: Option<&'static str>,
     /// Position in its file, from 0.
     position: usize,
@@ -149,12 +149,22 @@ impl Table {
         self
     }
 
-    /// With the units that the file has for columns (from 0): their numbers become those of ours, and their names end in it.
+    /// The columns at these positions (from 0) are in s, whatever the file says.
+    pub(crate) fn in_seconds(mut self, positions: &[usize]) -> Self {
+        for column in &mut self.columns {
+            if positions.contains(&column.position) {
+                column.unit = Some("s");
+            }
+        }
+        self
+    }
+
+    /// With the units that a line of the file has for its columns: their numbers become those of ours, and their names end in it.
     pub(crate) fn in_units(mut self, line: u64, units: &[Option<Unit>]) -> Self {
         let mut told = Vec::new();
         let mut taken: HashSet<String> = self.names().map(str::to_owned).collect();
         for column in &mut self.columns {
-            let Some(Some(unit)) = units.get(column.position) else {
+            let (None, Some(Some(unit))) = (column.unit, units.get(column.position)) else {
                 continue;
             };
             column.unit = Some(unit.symbol);
@@ -288,7 +298,7 @@ impl Table {
                     .for_each(|value| *value = 0.0 - *value);
             }
             if let Some(wanted) = name::unit(name) {
-                // What a line of units says is done already.
+                // What is known has been turned already.
                 let stated = column
                     .unit
                     .is_none()

@@ -244,6 +244,11 @@ fn times_may_be_those_of_clocks_and_calendars() {
         let same = |(one, other): (&f64, &f64)| one == other || (one.is_nan() && other.is_nan());
         assert!(times.iter().zip(&expected).all(same), "{text}: {times:?}");
     }
+    // They are in s whatever the file says of them.
+    let read = mapped("Time (h),I\n0:00:30,1\n0:01:00,2\n", &["t_s=Time (h)"]).unwrap();
+    assert_eq!(read.need("t_s").unwrap(), [30.0, 60.0]);
+    let read = table("t_s,I\nmin,A\n0:00:30,1\n0:01:00,2\n").unwrap();
+    assert_eq!(read.need("t_s").unwrap(), [30.0, 60.0]);
     // The first that is there says what they are.
     let read = table("x,t_s\n1,\n2,08:00:00\n").unwrap();
     assert_eq!(read.need("t_s").unwrap()[1], 28_800.0);

@@ -141,28 +141,28 @@ struct Candidate<'a> {
 }
 
 impl<'a> Candidate<'a> {
-    /// With the separator that fits best; of several, and of none, the one that stands first: a comma, then where the line has none
-    /// outside of quotation marks a semicolon or a tab.
+    /// With the separator that fits best; of several the one that stands first: a comma, a semicolon, a tab. Those within quotation
+    /// marks are none.
     fn of(stated: Option<u8>, line: u64, text: &'a str, after: &Lines<'_>) -> Self {
-        let outside = outside_of_quotation_marks(text);
-        let mut separators: Vec<u8> = match stated {
+        let separators = match stated {
             Some(stated) => vec![stated],
-            None => (*b",;\t").into_iter().collect(),
-        };
-        separators.retain(|separator| stated.is_some() || outside.contains(separator));
-        if separators.is_empty() {
-            separators.push(b',');
-        }
-        let mut best: Option<Self> = None;
-        for separator in separators {
-            let candidate = Self::with(separator, line, text, after);
-            let is_better =
-                |best: &Self| (best.has_rows(), best.fit) < (candidate.has_rows(), candidate.fit);
-            if best.as_ref().is_none_or(is_better) {
-                best = Some(candidate);
+            None => {
+                let outside = outside_of_quotation_marks(text);
+                let is_there = |separator: &u8| outside.contains(separator);
+                b",;\t".iter().copied().filter(is_there).collect()
             }
-        }
-        best.unwrap_or_else(|| Self::with(b',', line, text, after))
+        };
+        let with = |separator| Self::with(separator, line, text, after);
+        let better = |best: Self, other: Self| {
+            let rank = |candidate: &Self| (candidate.has_rows(), candidate.fit);
+            if rank(&other) > rank(&best) {
+                other
+            } else {
+                best
+            }
+        };
+        let best = separators.into_iter().map(with).reduce(better);
+        best.unwrap_or_else(|| with(b','))
     }
 
     fn with(separator: u8, line: u64, text: &'a str, after: &Lines<'_>) -> Self {

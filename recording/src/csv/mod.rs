@@ -89,7 +89,11 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
     }
 
     let (mut numbers, mut positions, mut left_out) = (Vec::new(), Vec::new(), Vec::new());
+    let mut times = Vec::new();
     for (position, (name, values)) in names.iter().zip(columns).enumerate() {
+        if values.are_times() {
+            times.push(position);
+        }
         let read = values.into_numbers();
         if name.is_empty() {
             // Separators after the last column make one without a name, and nothing in it.
@@ -119,8 +123,9 @@ pub fn parse(source: &str, bytes: &[u8]) -> Result<Table> {
     if let ([], Some(first)) = (numbers.as_slice(), left_out.first()) {
         return Err(first.error.clone());
     }
-    let mut table =
-        Table::with_lines(source, numbers, line_numbers)?.with_left_out(&positions, left_out);
+    let mut table = Table::with_lines(source, numbers, line_numbers)?
+        .with_left_out(&positions, left_out)
+        .in_seconds(&times);
     if let Some(encoding) = encoding {
         table.note(format!("read as {encoding}, for it is not UTF-8"));
     }

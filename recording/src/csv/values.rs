@@ -52,6 +52,11 @@ impl Values {
         }
     }
 
+    /// They were times as clocks and calendars show them.
+    pub(super) fn are_times(&self) -> bool {
+        self.moments.is_some()
+    }
+
     /// The numbers, or the first field that is none.
     pub(super) fn into_numbers(self) -> Result<Vec<f64>> {
         self.read
