@@ -58,7 +58,8 @@ pub(super) fn find<'a>(source: &str, text: &'a str) -> Result<(Head, Lines<'a>)>
         ));
     };
     let mut chosen = Candidate::of(stated, first_line, first, &lines);
-    if !(chosen.has_rows() && chosen.fit == Fit::All) && !chosen.is_above_numbers(&lines) {
+    let has_numbers_below = chosen.has_rows() && chosen.fit == Fit::All;
+    if !(has_numbers_below || chosen.is_above_numbers(&lines)) {
         let mut rest = lines.clone();
         for _ in 0..LOOKED_AT {
             let Some((line, text)) = rest.next() else {
